@@ -7,6 +7,7 @@ and says in one line what is wrong.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -125,8 +126,8 @@ def require_distinct(paths: Iterable[Path]) -> None:
                 raise ProcessError(f"{path} is given twice{also}; it would count twice.")
 
 
-def require_picture(path: Path, error: type[ProcessError] = ProcessError) -> None:
-    """Raise `error` for what is no picture or too large: a few kilobytes can promise a picture of terabytes."""
+def require_picture(path: Path, error: type[ProcessError] = ProcessError) -> int:
+    """Pages of a picture. Raises `error` if it is none or too large: a few kilobytes can promise terabytes."""
     from PIL import Image
 
     require_file(path, error)
@@ -136,6 +137,7 @@ def require_picture(path: Path, error: type[ProcessError] = ProcessError) -> Non
             warnings.simplefilter("ignore")
             with Image.open(path) as picture:
                 wide, high = picture.size
+                pages = int(getattr(picture, "n_frames", 1))
     except Image.DecompressionBombError as why:
         raise error(f"{path}: {one_line(why)}; at most {MOST_PIXELS:,} pixels are read") from why
     except Exception as why:
@@ -143,20 +145,39 @@ def require_picture(path: Path, error: type[ProcessError] = ProcessError) -> Non
         raise error(f"{path}: is not an image that can be read (PNG or TIFF)") from why
     if wide * high > MOST_PIXELS:
         raise error(f"{path}: {wide} x {high} pixels; at most {MOST_PIXELS:,} pixels are read")
+    return pages
 
 
-def read_text(path: Path, error: type[ProcessError] = ProcessError, most_bytes: int = MOST_TEXT_BYTES) -> str:
-    """Text of a UTF-8 file, with or without a byte order mark. Raises `error`."""
+def read_bytes(path: Path, error: type[ProcessError], most_bytes: int) -> bytes:
+    """Content of a regular file. Raises `error`."""
     size = require_file(path, error, most_bytes, may_be_empty=True)
     try:
         # No more than was looked at, and without waiting: another program may have put a pipe there meanwhile.
         without_waiting = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
         with open(os.open(path, os.O_RDONLY | without_waiting), "rb") as file:
-            return (file.read(size) or b"").decode("utf-8-sig")
+            return file.read(size) or b""
     except OSError as why:
         raise error(f"{path}: cannot be read ({why.strerror})") from why
+
+
+def read_text(path: Path, error: type[ProcessError] = ProcessError, most_bytes: int = MOST_TEXT_BYTES) -> str:
+    """Text of a UTF-8 file, with or without a byte order mark. Raises `error`."""
+    try:
+        return read_bytes(path, error, most_bytes).decode("utf-8-sig")
     except UnicodeDecodeError as why:
         raise error(f"{path}: is not UTF-8 text") from why
+
+
+def read_text_of_any_system(path: Path, error: type[ProcessError] = ProcessError) -> str:
+    """Text of a table from a spreadsheet or a log: UTF-8, UTF-16 with a mark, or Windows-1252. Raises `error`."""
+    data = read_bytes(path, error, MOST_TEXT_BYTES)
+    encodings = ("utf-16",) if data[:2] in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig", "cp1252")
+    for encoding in encodings:
+        with contextlib.suppress(UnicodeDecodeError):
+            text = data.decode(encoding)
+            if "\0" not in text:
+                return text
+    raise error(f"{path}: is not text (UTF-8, UTF-16 or Windows-1252)")
 
 
 def parse_json(text: str | bytes, source: str, error: type[ProcessError] = ProcessError) -> Any:

@@ -111,7 +111,7 @@ def test_states_as_spreadsheets_save_them(tmp_path, delimiter):
     assert states.channels["camera"].tolist() == [1000.25, 900.0]
 
 
-@pytest.mark.parametrize(("delimiter", "angle", "cell"), [(";", "7,5", "1.000"), ("\t", "7.5", "1,5")])
+@pytest.mark.parametrize(("delimiter", "angle", "cell"), [(";", "7,5", "1.000"), ("\t", "7,5", "1.000")])
 def test_a_number_that_could_be_two_is_refused(tmp_path, delimiter, angle, cell):
     path = spreadsheet(tmp_path, delimiter, [("0", angle, "3"), ("1", "15", cell)])
     with pytest.raises(ImportFailed, match=f"states.csv:3: column channel_camera: '{cell}' is not a finite number"):

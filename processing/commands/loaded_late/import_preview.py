@@ -31,7 +31,7 @@ def show_understood(request: ImportRequest) -> None:
             str(k),
             states.role[k],
             *(f"{angles[k]:.3f}" for angles in states.angles_deg.values()),
-            states.files[k].name if states.files and k < len(states.files) else f"[{k}]",
+            source.names[k] if k < len(source.names) else f"[{k}]",
             f"{np.nanmean(frame):.6g}",
         ]
         for k, frame in enumerate(frames)

@@ -2,27 +2,50 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
+
 import numpy as np
 
-from processing.storage.formats.foreign_arrays import ImportFailed
+from processing.storage.formats.foreign_arrays import ImportFailed, stated_unit
 from processing.storage.formats.state_csv import StatesFile
 
-#: An axis whose angles lie in a range of 2 pi or less, in steps below this, is hardly in degrees.
+#: An axis whose angles are in steps below this, in degrees, over no more than 5 turns in radians is hardly in degrees.
 STEP_DEG = 1.0
+MOST_RAD = 10 * np.pi
 #: No polarimeter of plates and polarizers works outside these wavelengths, far ultraviolet to terahertz.
 WAVELENGTHS_NM = (100.0, 3e6)
+_RADIANS = re.compile(r"(?<![a-z])rad(ians?)?(?![a-z])", re.IGNORECASE)
+_MILLISECONDS = re.compile(r"(?<![a-z])(ms|msec|milliseconds?)(?![a-z])", re.IGNORECASE)
 #: Nanometres in other units of length.
 _UNITS = {"micrometres": 1e3, "metres": 1e9, "angstrom": 0.1}
 
 
-def require_degrees(states: StatesFile) -> None:
-    """Raise ImportFailed where the angles of an axis are probably in radians."""
-    for name, angles in states.angles_deg.items():
-        known = np.unique(angles[np.isfinite(angles)])
-        if known.size > 2 and known[-1] - known[0] <= 2 * np.pi and np.diff(known).max() < STEP_DEG:
+def require_unit(states: StatesFile, columns: Mapping[str, str], angles: str | None) -> None:
+    """Raise ImportFailed where the angles of an axis, or times, are probably in another unit than assumed."""
+    for name, degrees in states.angles_deg.items():
+        known = np.unique(degrees[np.isfinite(degrees)])
+        turn = float(np.ptp(known)) if known.size else 0.0
+        unit = stated_unit(columns.get(name, columns.get(f"{name}_deg", "")))
+        if angles == "radians" and np.deg2rad(turn) > 2 * MOST_RAD:
             raise ImportFailed(
-                f"{states.path}: axis {name} turns by {known[-1] - known[0]:.3g} degrees in all, in steps below "
-                f"{STEP_DEG:g}. These angles are probably in radians. Add --angles radians, or --angles degrees"
+                f"{states.path}: axis {name} turns by {np.deg2rad(turn):.3g} radians, which is {turn / 360:.3g} turns. "
+                "These angles are probably in degrees. Add --angles degrees"
+            )
+        if angles is not None:
+            continue
+        small = known.size > 2 and turn <= MOST_RAD and np.diff(known).max() < STEP_DEG
+        if small or _RADIANS.search(unit):
+            why = f"{unit.strip()!r} says so" if _RADIANS.search(unit) else f"in steps below {STEP_DEG:g}"
+            raise ImportFailed(
+                f"{states.path}: axis {name} turns by {turn:.3g} degrees in all, {why}. "
+                "These angles are probably in radians. Add --angles radians, or --angles degrees"
+            )
+    for name in ("exposure_s", "time_s"):
+        if name in columns and _MILLISECONDS.search(stated_unit(columns[name])):
+            raise ImportFailed(
+                f"{states.path}: {name} is in seconds, and the column is {columns[name]!r}. "
+                f"Add --columns '{name.removesuffix('s')}ms={columns[name]}'"
             )
 
 

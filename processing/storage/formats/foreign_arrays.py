@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import glob
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.doors import one_line, require_file
+from processing.doors import one_line, read_text_of_any_system, require_file
 from processing.errors import ProcessError
 from processing.storage.integrity.h5_door import damage_as, open_h5, read_npy, require_dataset
 
@@ -24,14 +26,21 @@ class ImportFailed(ProcessError):
 FRAME_SUFFIXES = (".npy", ".png", ".tif", ".tiff")
 #: Files with named or single arrays.
 ARRAY_SUFFIXES = (".npy", ".mat", ".h5", ".hdf5", ".hdf", ".nxs")
-#: FILE, an optional ::NAME, and an optional column [K].
-_ADDRESS = re.compile(r"(?P<file>.+?)(?:::(?P<name>[^\[\]]+))?(?:\[(?P<column>\d{1,4})\])?")
+#: Text files with numbers in columns, without names.
+TEXT_SUFFIXES = (".txt", ".dat", ".csv", ".tsv")
+#: FILE, an optional ::NAME, and an optional column [K] or [FIELD].
+_ADDRESS = re.compile(r"(?P<file>.+?)(?:::(?P<name>[^\[\]]+))?(?:\[(?P<column>[^\[\]]{1,80})\])?")
+#: A part of a pattern of file names that has the numbers of an axis, as `G{psg}_A{psa}.tif`.
+_IN_NAME = re.compile(r"\{([A-Za-z]\w*)\}")
+_NUMBER = r"([-+]?\d{1,9}(?:[.,]\d{1,9})?)"
 
 
 def is_array(text: str) -> bool:
     """Whether a text addresses an array in a file, as `FILE::NAME`, `FILE.npy` or `FILE.mat::NAME[K]`."""
     match = _ADDRESS.fullmatch(text)
-    return match is not None and (match["name"] is not None or match["file"].lower().endswith(ARRAY_SUFFIXES))
+    if match is None:
+        return False
+    return match["name"] is not None or match["file"].lower().endswith(ARRAY_SUFFIXES + TEXT_SUFFIXES)
 
 
 def read_column(text: str) -> NDArray[np.float64]:
@@ -47,21 +56,59 @@ def read_column(text: str) -> NDArray[np.float64]:
     """
     match = _ADDRESS.fullmatch(text)
     assert match is not None
-    values = np.squeeze(open_array(text.removesuffix(f"[{match['column']}]"))[...])
-    if values.ndim == 2 and match["column"] is not None:
-        if int(match["column"]) >= values.shape[1]:
-            raise ImportFailed(f"{text}: the table has {values.shape[1]} columns; the first one is [0]")
-        values = values[:, int(match["column"])]
+    column = match["column"]
+    with damage_as(ImportFailed, f"{text}: cannot be read"):
+        if match["file"].lower().endswith(TEXT_SUFFIXES):
+            values: NDArray[Any] = _text_table(Path(match["file"]))
+        else:
+            values = np.squeeze(open_array(text.removesuffix(f"[{column}]"), "uifV")[...])
+    if values.dtype.names is not None and column in values.dtype.names:
+        values = values[str(column)]
+    elif values.ndim == 2 and column is not None and column.isdecimal():
+        # A table has more states than columns.
+        table = values.T if values.shape[0] < values.shape[1] else values
+        if int(column) >= table.shape[1]:
+            raise ImportFailed(f"{text}: the table has {table.shape[1]} columns; the first one is [0]")
+        values = table[:, int(column)]
     if values.ndim != 1 or values.dtype.kind not in "uif":
+        first = "0" if values.dtype.names is None else values.dtype.names[0]
+        fields = f" ({', '.join(values.dtype.names)})" if values.dtype.names else ""
         raise ImportFailed(
-            f"{text}: shape {values.shape} of {values.dtype}; one number a state is needed. "
-            "Choose a column of a table as FILE::NAME[0]"
+            f"{text}: shape {values.shape} of {values.dtype.name}{fields}; one number a state is needed. "
+            f"Choose a column of a table as '{text.removesuffix(f'[{column}]')}[{first}]'"
         )
     return np.asarray(values, dtype=float)
 
 
-def open_array(text: str) -> Any:
+def stated_unit(text: str) -> str:
+    """What says in which unit numbers are: the header of a column, or the attribute `units` of a dataset."""
+    if not is_array(text):
+        return text
+    match = _ADDRESS.fullmatch(text)
+    if match is None or match["file"].lower().endswith((".npy", ".mat", *TEXT_SUFFIXES)):
+        return match["column"] or "" if match else ""
+    attributes = getattr(open_array(text.removesuffix(f"[{match['column']}]"), "uifV"), "attrs", {})
+    return f"{match['column'] or ''} {attributes.get('units', attributes.get('unit', ''))}"
+
+
+def _text_table(file: Path) -> NDArray[np.float64]:
+    """Numbers of a text file without names: (rows,) or (rows, columns)."""
+    lines = [line for line in read_text_of_any_system(file, ImportFailed).splitlines() if line.strip("\ufeff \t")]
+    lines = [line for line in lines if not line.lstrip().startswith("#")]
+    delimiter = next((d for d in ";\t" if lines and d in lines[0]), None)
+    if delimiter is None and lines and "," in lines[0]:
+        delimiter = ","
+    else:
+        lines = [line.replace(",", ".") for line in lines]
+    return np.asarray(np.loadtxt(lines, delimiter=delimiter, ndmin=1, comments=None))
+
+
+def open_array(text: str, kinds: str = "uif") -> Any:
     """An array with shape, dtype and slices, as `FILE.npy`, `FILE::NAME` of HDF5 or `FILE.mat::NAME`.
+
+    Parameters
+    ----------
+    kinds : letters of numpy for the types that are allowed in HDF5.
 
     Raises
     ------
@@ -77,36 +124,70 @@ def open_array(text: str) -> Any:
             return _matlab_array(file, inside)
         h5 = open_h5(file, ImportFailed)
         inside = inside or _only_stack(h5, name)
-        dataset = require_dataset(h5, inside, (None,) * getattr(h5.get(inside), "ndim", 3), "uif")
+        dataset = require_dataset(h5, inside, (None,) * getattr(h5.get(inside), "ndim", 3), kinds)
         # MATLAB writes its axes in the order of Fortran.
         return dataset[...].T if name.endswith(".mat") else dataset
 
 
-def frame_files(text: str) -> tuple[Path, ...] | None:
+@dataclass(frozen=True)
+class FrameFiles:
+    """Files with frames, in natural order, and the numbers that their names have: name to (N,)."""
+
+    files: tuple[Path, ...]
+    numbers: dict[str, NDArray[np.float64]]
+
+
+def frame_files(text: str) -> FrameFiles | None:
     """The frames of a folder or a pattern such as `run/*.tif`, frame 2 before frame 10; None of a single file.
+
+    A pattern may have names of axes, as `run/G{psg}_A{psa}.tif`: the file names then have the angles.
 
     Raises
     ------
     ImportFailed : the folder has no frames, or no file is of that pattern.
     """
-    folder = Path(text)
+    folder, numbers = Path(text), {}
     if folder.is_dir():
         files = [f for f in folder.iterdir() if f.suffix.lower() in FRAME_SUFFIXES]
     elif glob.has_magic(text) and not folder.exists():
         files = [Path(f) for f in glob.glob(text)]
+    elif _IN_NAME.search(folder.name) and not folder.exists():
+        parts = _IN_NAME.split(folder.name)
+        pattern = re.compile("".join(_NUMBER if k % 2 else re.escape(part) for k, part in enumerate(parts)))
+        found = folder.parent.iterdir() if folder.parent.is_dir() else ()
+        files = _naturally([f for f in found if pattern.fullmatch(f.name)])
+        texts = [pattern.fullmatch(f.name).groups() for f in files]  # type: ignore[union-attr]
+        numbers = {
+            name: np.array([float(row[k].replace(",", ".")) for row in texts]) for k, name in enumerate(parts[1::2])
+        }
     else:
         return None
     if not files:
         raise ImportFailed(f"{one_line(text)}: no frames there ({', '.join(FRAME_SUFFIXES)})")
-    return tuple(sorted(files, key=lambda f: [int(p) if p.isdecimal() else p for p in re.split(r"(\d+)", f.name)]))
+    return FrameFiles(tuple(_naturally(files)), numbers)
 
 
-def states_first(stack: Any, states: int) -> Any:
+def _naturally(files: list[Path]) -> list[Path]:
+    return sorted(files, key=lambda f: [int(p) if p.isdecimal() else p for p in re.split(r"(\d+)", f.name)])
+
+
+def missing_numbers(files: Sequence[Path]) -> str:
+    """Numbers that the names of files leave out, as text; empty where the names are not numbered."""
+    found = [re.findall(r"\d{1,9}", f.stem) for f in files]
+    numbers = {int(n[-1]) for n in found if n}
+    if len(numbers) < len(files) or max(numbers) - min(numbers) > 2 * len(files):
+        return ""
+    return ", ".join(str(n) for n in range(min(numbers), max(numbers)) if n not in numbers)
+
+
+def states_first(stack: Any, states: int | None, frame: tuple[int, int] | None = None) -> Any:
     """The stack with its states along the first axis; MATLAB's usual order has them along the last one."""
     shape = tuple(stack.shape)
-    if len(shape) == 3 and shape[0] != states and shape[-1] == states:
-        return np.moveaxis(stack[...], -1, 0)
-    return stack
+    if len(shape) != 3:
+        return stack
+    of_count = shape[-1] == states and shape[0] != states
+    of_frame = frame is not None and shape[:2] == frame and shape[-2:] != frame
+    return np.moveaxis(stack[...], -1, 0) if of_count or of_frame else stack
 
 
 def _matlab_array(file: Path, name: str) -> NDArray[Any]:
@@ -115,7 +196,8 @@ def _matlab_array(file: Path, name: str) -> NDArray[Any]:
     arrays = {n: shape for n, shape, _ in whosmat(file)}
     name = name or (next(iter(arrays)) if len(arrays) == 1 else "")
     if name not in arrays:
-        raise ImportFailed(f"{file}: choose an array as {file}::NAME; it has {', '.join(arrays) or 'none'}")
+        asked = f"no array {name!r}; " if name else ""
+        raise ImportFailed(f"{file}: {asked}it has {', '.join(arrays) or 'none'}. Choose one as {file}::NAME")
     return np.asarray(loadmat(file, variable_names=[name])[name])
 
 

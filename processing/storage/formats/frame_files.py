@@ -13,25 +13,32 @@ from processing.storage.formats.axostep import read_rmmd
 from processing.storage.formats.foreign_arrays import ImportFailed, open_array, states_first
 from processing.storage.integrity.h5_door import damage_as, read_npy
 
+#: Kinds of pictures that may have several pages.
+PAGED = (".tif", ".tiff")
 
-def read_frame(file: Path) -> NDArray[Any]:
-    """Raw grey values (rows, columns) of a PNG, TIFF or .npy file. Raises ImportFailed."""
-    if file.suffix != ".npy":
-        return _read_picture(file)
+
+def read_frame(file: Path, page: int | None = None) -> NDArray[Any]:
+    """Raw grey values (rows, columns) of a PNG, TIFF or .npy file, or of one page of a TIFF. Raises ImportFailed."""
+    if file.suffix.lower() != ".npy":
+        return _read_picture(file, page)
     values = read_npy(file, ImportFailed)
     if values.ndim != 2 or not 0 < values.size <= MOST_PIXELS:
         raise ImportFailed(f"{file}: shape {values.shape}; a frame has rows and columns. Frames of all states: --stack")
     return values
 
 
-def _read_picture(file: Path) -> NDArray[Any]:
+def _read_picture(file: Path, page: int | None) -> NDArray[Any]:
     import cv2
 
-    require_picture(file, ImportFailed)
+    pages = require_picture(file, ImportFailed)
+    if page is None and pages > 1:
+        raise ImportFailed(
+            f"{file}: has {pages} pages, and one frame a state is needed. If each page is a state, add --stack '{file}'"
+        )
     # What is wrong is said in one line here, not in the library's own words.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) if not page else _page(file, page)
     except cv2.error as error:
         raise ImportFailed(f"{file}: is damaged ({one_line(error)})") from error
     if image is None:
@@ -45,18 +52,27 @@ def _read_picture(file: Path) -> NDArray[Any]:
     return np.asarray(image)
 
 
-def open_stack(text: str, states: int) -> Any:
+def _page(file: Path, page: int) -> NDArray[Any] | None:
+    import cv2
+
+    is_read, images = cv2.imreadmulti(str(file), page, 1, flags=cv2.IMREAD_UNCHANGED)
+    return np.asarray(images[0]) if is_read and images else None
+
+
+def open_stack(text: str, states: int | None, frame: tuple[int, int] | None = None) -> Any:
     """Frames of all states as something with shape, type and slices. Raises ImportFailed.
 
     Parameters
     ----------
     text : FILE.npy, FILE.rmmd, FILE.mat::NAME, or HDF5 as FILE::/path/to/dataset.
+    frame : rows and columns of a frame, where they are known.
     """
-    if text.endswith(".rmmd"):
+    if text.lower().endswith(".rmmd"):
         with damage_as(ImportFailed, f"{text}: cannot be read"):
             require_file(Path(text), ImportFailed)
-            return read_rmmd(Path(text)).states(states)
-    return states_first(open_array(text), states)
+            frames = read_rmmd(Path(text))
+            return frames.frames if states is None else frames.states(states)
+    return states_first(open_array(text), states, frame)
 
 
 def check_stack(text: str, stack: Any, states: int, channels: int) -> None:

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.computing.threads import thread_count
-from processing.doors import one_line, read_text, require_place, require_room
+from processing.doors import one_line, read_text, require_picture, require_place, require_room
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.nexus import attach
 from processing.storage.captures.schema import CaptureHeader, Detector, Sample, create_layout, write_closing
-from processing.storage.formats.doubtful_units import require_degrees, require_nm
-from processing.storage.formats.foreign_arrays import ImportFailed, frame_files
-from processing.storage.formats.frame_files import check_stack, open_stack, read_frame
+from processing.storage.formats.doubtful_units import require_nm, require_unit
+from processing.storage.formats.foreign_arrays import FrameFiles, ImportFailed, frame_files, missing_numbers
+from processing.storage.formats.frame_files import PAGED, check_stack, open_stack, read_frame
 from processing.storage.formats.state_csv import StatesFile, read_states
 from processing.storage.integrity.checksums import row_crc32, write_checksums
 from processing.storage.integrity.h5_door import read_npy
@@ -40,12 +40,20 @@ MOST_SAMPLE_BYTES = 1 << 16
 
 @dataclass(frozen=True)
 class FrameSource:
-    """Frames of all states, whatever they come from: shape (channels, rows, columns), type, and an iterator."""
+    """Frames of all states, whatever they come from: shape (channels, rows, columns), type, and an iterator.
+
+    `names` has the file of each frame, where there are files.
+    """
 
     shape: tuple[int, int, int]
     dtype: np.dtype[Any]
     frames: Callable[[], Iterator[Frame]]
     channels: tuple[str, ...]
+    names: tuple[str, ...] = ()
+
+
+#: A file, and a page of it where it has several.
+Place = tuple[Path, int | None]
 
 
 @dataclass(frozen=True)
@@ -89,17 +97,88 @@ def understand(request: ImportRequest) -> Understood:
     if request.instrument is not None:
         model = InstrumentModel.load(request.instrument)
         model.at(request.wavelength_nm)
-    states = read_states(request.states, model.axes if model else (), request.columns, request.angles == "radians")
-    if request.angles is None:
-        require_degrees(states)
-    if request.stack is not None and states.files is None and (files := frame_files(request.stack)) is not None:
-        if len(files) != len(states):
-            raise ImportFailed(f"{request.stack}: {len(files)} frames for {len(states)} states of {states.path}")
-        states, request = replace(states, files=files), replace(request, stack=None)
-    source = _source(request, states, model)
+    found = frame_files(request.stack) if request.stack is not None else None
+    places = _places(request.stack, found)
+    names = tuple(c.name for c in model.channels) if model and model.mosaic is None else ("camera",)
+    count = None
+    if model is not None and not model.axes and request.stack is not None:
+        # Nothing turns: each frame is a state, and no table has to say more of it.
+        count = len(places) if places else _count(request.stack, len(names))
+    states = read_states(
+        request.states,
+        model.axes if model else (),
+        request.columns,
+        request.angles == "radians",
+        arrays=found.numbers if found else None,
+        count=count,
+        source=request.stack or "frames",
+    )
+    require_unit(states, request.columns, request.angles)
+    if states.files is not None:
+        folder = states.path.parent
+        if found is None:
+            places = tuple((folder / name, None) for name in states.files)
+        else:
+            places = _named_files(request, states, found)
+    elif found is not None:
+        _require_order(request, states, found)
+    source = _source(request, states, places, names, has_model=model is not None)
     if request.darks is not None:
         states, source = _with_darks(request.darks, states, source)
     return Understood(states, source, model)
+
+
+def _places(stack: str | None, found: FrameFiles | None) -> tuple[Place, ...]:
+    """Frames of a folder, a picture, or the pages of a picture; empty for other stacks."""
+    if stack is None or found is not None:
+        return tuple((file, None) for file in found.files) if found else ()
+    file = Path(stack)
+    if file.suffix.lower() not in (*PAGED, ".png"):
+        return ()
+    pages = require_picture(file, ImportFailed)
+    return tuple((file, page) for page in range(pages)) if pages > 1 else ((file, None),)
+
+
+def _count(stack: str, channels: int) -> int:
+    """States of a stack in which nothing turns."""
+    shape = open_stack(stack, None).shape
+    return int(shape[0]) if len(shape) == 4 or (len(shape) == 3 and channels == 1) else 1
+
+
+def _plain(name: str) -> str:
+    """The name of a file without its folder, as the table of another system may write it."""
+    return name.replace("\\", "/").rpartition("/")[2]
+
+
+def _named_files(request: ImportRequest, states: StatesFile, found: FrameFiles) -> tuple[Place, ...]:
+    """The files of a folder that a column of the table names, with their ending or without."""
+    of_name = {file.stem: file for file in found.files} | {file.name: file for file in found.files}
+    absent = [(line, n) for line, n in zip(states.line, states.files or (), strict=True) if _plain(n) not in of_name]
+    if absent:
+        line, name = absent[0]
+        raise ImportFailed(f"{states.path}:{line}: column file: {request.stack} has no frame {one_line(name)}")
+    return tuple((of_name[_plain(name)], None) for name in states.files or ())
+
+
+def _require_order(request: ImportRequest, states: StatesFile, found: FrameFiles) -> None:
+    """Raise ImportFailed where there is not a frame for each state, or a column names the files in another order."""
+    names = {file.name for file in found.files} | {file.stem for file in found.files}
+    for column, cells in states.ignored.items():
+        plain = [_plain(cell) for cell in cells]
+        if set(plain) <= names and len(set(plain)) == len(plain):
+            in_order = [n in (f.name, f.stem) for n, f in zip(plain, found.files, strict=False)]
+            if not all(in_order) or len(in_order) != len(found.files):
+                raise ImportFailed(
+                    f"{states.path}: column {column!r} names the frames of {request.stack} in an order of its own, or "
+                    f"not all of them. Add --columns 'file={column}'"
+                )
+    if len(found.files) != len(states):
+        gap = missing_numbers(found.files)
+        numbers = f"; their names leave out {one_line(gap, 60)}" if gap else ""
+        raise ImportFailed(
+            f"{request.stack}: {len(found.files)} frames for {len(states)} states of {states.path}{numbers}. Remove "
+            "what has no counterpart, or name the frames in a column of the table: --columns file=COLUMN"
+        )
 
 
 def import_capture(request: ImportRequest, progress: Progress | None = None) -> CaptureHeader:
@@ -171,22 +250,24 @@ def _write(
     write_closing(h5, "complete", {"imported": now})
 
 
-def _source(request: ImportRequest, states: StatesFile, model: InstrumentModel | None) -> FrameSource:
+def _source(
+    request: ImportRequest, states: StatesFile, places: tuple[Place, ...], names: tuple[str, ...], has_model: bool
+) -> FrameSource:
     given = {
         "the column `file`": states.files is not None,
-        "--stack": request.stack is not None,
+        "--stack": request.stack is not None and (states.files is None or not places),
         "columns `channel_<name>`": bool(states.channels),
     }
     ways = [name for name, present in given.items() if present]
     if len(ways) != 1:
         found = " and ".join(ways) or "none of them"
         raise ImportFailed(f"{states.path}: frames come from exactly one of {', '.join(given)}; found {found}.")
-    names = tuple(c.name for c in model.channels) if model and model.mosaic is None else ("camera",)
     if states.channels:
-        return _fluxes(states, names if model else tuple(states.channels))
-    if request.stack is not None:
-        return _stack(request.stack, states, names)
-    return _images(states, names)
+        return _fluxes(states, names if has_model else tuple(states.channels))
+    if places:
+        return _images(states, places, names)
+    assert request.stack is not None
+    return _stack(request.stack, states, names)
 
 
 def _fluxes(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
@@ -201,28 +282,34 @@ def _fluxes(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
 
 def _stack(text: str, states: StatesFile, names: tuple[str, ...]) -> FrameSource:
     stack = open_stack(text, len(states))
+    if len(states) == 1 and len(stack.shape) in (2, 3) and len(stack.shape) - 2 == (len(names) > 1):
+        stack = stack[...][None]
     check_stack(text, stack, len(states), len(names))
     per_state = (len(names), *stack.shape[-2:])
     return FrameSource(per_state, stack.dtype, lambda: (np.asarray(s).reshape(per_state) for s in stack), names)
 
 
-def _images(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
+def _images(states: StatesFile, places: tuple[Place, ...], names: tuple[str, ...]) -> FrameSource:
     if len(names) != 1:
         raise ImportFailed(
             f"{states.path}: one image a state is one channel, but the instrument has {', '.join(names)}; "
             "give a --stack (states, channels, rows, columns) or channel columns."
         )
-    files = states.files or ()
-    absent = [(line, file) for line, file in zip(states.line, files, strict=True) if not os.path.isfile(file)]
+    if len(places) != len(states):
+        raise ImportFailed(f"{places[0][0]}: {len(places)} pages for {len(states)} states of {states.path}")
+    absent = [(line, file) for line, (file, _) in zip(states.line, places, strict=True) if not os.path.isfile(file)]
     if absent:
         line, file = absent[0]
         more = f" (and {len(absent) - 1} more)" if len(absent) > 1 else ""
-        raise ImportFailed(f"{states.path}:{line}: column file: no such frame: {one_line(file)}{more}")
-    first = read_frame(files[0])
+        raise ImportFailed(
+            f"{states.path}:{line}: column file: no such frame: {one_line(file)}{more}. If the frames are in another "
+            "folder, add --stack FOLDER"
+        )
+    first = read_frame(*places[0])
 
-    def load(item: tuple[int, Path]) -> Frame:
-        line, file = item
-        image = read_frame(file)
+    def load(item: tuple[int, Place]) -> Frame:
+        line, (file, page) = item
+        image = read_frame(file, page)
         if image.shape != first.shape or image.dtype != first.dtype:
             raise ImportFailed(
                 f"{states.path}:{line}: {file.name} is {_kind(image)}, but the first frame is {_kind(first)}; "
@@ -232,7 +319,7 @@ def _images(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
 
     def frames() -> Iterator[Frame]:
         # Decoding releases the interpreter lock; a few frames ahead keep the writer fed at constant memory.
-        items = iter(list(zip(states.line, files, strict=True)))
+        items = iter(list(zip(states.line, places, strict=True)))
         with ThreadPoolExecutor(thread_count()) as pool:
             waiting = [pool.submit(load, item) for item in islice(items, 4 * thread_count())]
             while waiting:
@@ -240,7 +327,8 @@ def _images(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
                 waiting += [pool.submit(load, item) for item in islice(items, 1)]
                 yield frame
 
-    return FrameSource((1, *first.shape), first.dtype, frames, names)
+    shown = tuple(file.name if page is None else f"{file.name}[{page}]" for file, page in places)
+    return FrameSource((1, *first.shape), first.dtype, frames, names, shown)
 
 
 def _with_darks(text: str, states: StatesFile, source: FrameSource) -> tuple[StatesFile, FrameSource]:
@@ -248,11 +336,11 @@ def _with_darks(text: str, states: StatesFile, source: FrameSource) -> tuple[Sta
     exposures = states.exposure_s
     if exposures is not None and np.ptp(exposures) > 0:
         raise ImportFailed(f"--darks {text}: the states have several exposures; give darks their own rows in the CSV")
-    files = frame_files(text)
-    if files is not None:
-        darks = [read_frame(f)[None] for f in files]
+    places = _places(text, frame_files(text))
+    if places:
+        darks = [read_frame(*place)[None] for place in places]
     else:
-        stack = open_stack(text, -1)
+        stack = open_stack(text, None, source.shape[1:])
         stack = stack[...][None] if len(stack.shape) == 2 else stack
         check_stack(text, stack, stack.shape[0], source.shape[0])
         darks = [np.asarray(s).reshape(source.shape[0], *stack.shape[-2:]) for s in stack]
@@ -260,7 +348,7 @@ def _with_darks(text: str, states: StatesFile, source: FrameSource) -> tuple[Sta
     if any(d.shape != source.shape or d.dtype != source.dtype for d in darks):
         raise ImportFailed(
             f"--darks {text}: {_kind(darks[0][0])}, but a frame of the sample is {source.shape[2]} x {source.shape[1]} "
-            f"{source.dtype}; all must be alike."
+            f"{source.dtype}; all must be alike. Give raw dark frames, or their mean as --black-level COUNTS"
         )
 
     def longer(values: NDArray[np.float64] | None, by: float) -> NDArray[np.float64] | None:

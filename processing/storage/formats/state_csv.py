@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.doors import one_line, read_text
+from processing.doors import one_line, read_text_of_any_system
 from processing.storage.captures.schema import NOT_AXES
 from processing.storage.formats.foreign_arrays import ImportFailed, is_array, read_column
 
@@ -20,6 +20,10 @@ ROLES = ("sample", "air", "dark", "flat")
 CHANNEL_PREFIX = "channel_"
 #: Columns that are no axes.
 KNOWN = ("state", "role", "file", "time_s", "exposure_s", "sigma")
+#: Columns in another unit, and the factor to seconds.
+MILLI = {"time_ms": "time_s", "exposure_ms": "exposure_s"}
+#: In the place of a column for `state`: the states are in the order of the rows.
+IN_ORDER = "rows"
 #: What a column must look like, as a name in the capture file.
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_ .-]{0,63}")
 #: What may stand between columns; a spreadsheet takes semicolons where the comma is in the numbers.
@@ -46,8 +50,9 @@ class StatesFile:
     role : N roles; "sample" unless a `role` column says otherwise.
     time_s, exposure_s : (N,) or None.
     sigma : (N,) standard deviation of the noise of one value of the state, in counts, or None.
-    files : N paths or None.
+    files : N names of files as they stand in the table, or None.
     channels : channel name to (N,) flux; empty if there are none.
+    ignored : columns of the table that are not used: header to N cells.
     """
 
     path: Path
@@ -57,20 +62,28 @@ class StatesFile:
     time_s: NDArray[np.float64] | None
     exposure_s: NDArray[np.float64] | None
     sigma: NDArray[np.float64] | None
-    files: tuple[Path, ...] | None
+    files: tuple[str, ...] | None
     channels: dict[str, NDArray[np.float64]]
+    ignored: dict[str, list[str]]
 
     def __len__(self) -> int:
         return len(self.role)
 
 
 def read_states(
-    path: Path | None, axes: Sequence[str], columns: Mapping[str, str] | None = None, radians: bool = False
+    path: Path | None,
+    axes: Sequence[str],
+    columns: Mapping[str, str] | None = None,
+    radians: bool = False,
+    *,
+    arrays: Mapping[str, NDArray[np.float64]] | None = None,
+    count: int | None = None,
+    source: str = "frames",
 ) -> StatesFile:
     """Read a states file (CSV with a header line), arrays with a number a state, or both.
 
-    Columns are apart by commas, semicolons or tabs, as the header has them. Beside semicolons numbers may have decimal
-    commas; then none has a point.
+    Columns are apart by commas, semicolons, tabs or blanks, as the header has them. Beside semicolons and tabs numbers
+    may have decimal commas; then none has a point. Lines before the header that begin with # are comments.
 
     Parameters
     ----------
@@ -80,34 +93,40 @@ def read_states(
     columns : where the numbers of a name stand: a header of the file, or an array in another file (`FILE::NAME`). With
         it other columns of the file are not read, and states without a number are in the order of the rows.
     radians : whether angles are given in radians.
+    arrays : name to (N,), numbers that are known already.
+    count : states where neither a file nor an array says how many there are.
+    source : name for messages where there is no file.
 
     Raises
     ------
     ImportFailed : not readable, a column is missing, unknown or given twice, a number is none, a state is repeated.
     """
     mapping = {_axis_name(name): text for name, text in (columns or {}).items()}
-    arrays = {name: read_column(text) for name, text in mapping.items() if is_array(text)}
-    header, rows, delimiter = _table(path) if path is not None else _no_table(arrays)
-    path = path or Path(next(iter(mapping.values())).partition("::")[0])
+    known = {name: read_column(text) for name, text in mapping.items() if is_array(text)} | dict(arrays or {})
+    if path is not None:
+        header, rows, delimiter = _table(path)
+    else:
+        header, rows, delimiter = [], _rows_without_table(known, count), ","
+    path = path or Path(next((t for t in mapping.values() if is_array(t)), source).partition("::")[0])
+    ignored: dict[str, list[str]] = {}
     if mapping:
-        header, rows = _mapped(path, header, rows, {n: t for n, t in mapping.items() if n not in arrays}, axes)
-        header, rows = _with_arrays(path, header, rows, arrays)
+        of_file = {n: t for n, t in mapping.items() if n not in known}
+        header, rows, ignored = _mapped(path, header, rows, of_file, axes)
+    if "state" not in header:
+        header, rows = ["state", *header], [(line, [str(k), *row]) for k, (line, row) in enumerate(rows)]
+    header, rows = _with_arrays(path, header, rows, known)
     names = [_axis_name(h) for h in header]
+    _require_columns(path, header, names, axes)
     _check_names(path, names)
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise ImportFailed(f"{path}:1: column given twice: {', '.join(twice)}")
-    missing = [n for n in ("state", *axes) if n not in names]
-    if missing:
-        raise ImportFailed(
-            f"{path}:1: no column {', '.join(missing)}. Found: {', '.join(header)}. Every state needs its number and "
-            "the angle in degrees of each axis that the instrument turns."
-        )
     unknown = [h for h, n in zip(header, names, strict=True) if not _is_known(h, n, axes)]
     if unknown:
         raise ImportFailed(
-            f"{path}:1: unknown column {', '.join(unknown)}. An axis is called <axis>_deg; else there are "
-            f"{', '.join(KNOWN)} and {CHANNEL_PREFIX}<name>."
+            f"{path}:1: unknown column {one_line(', '.join(unknown))}. An axis is called <axis>_deg; else there are "
+            f"{', '.join(KNOWN)} and {CHANNEL_PREFIX}<name>. Columns are ignored once one of those used is named: "
+            f"--columns '{next(iter(axes), 'AXIS')}=COLUMN'"
         )
     texts_of = {name: [row[k] for _, row in rows] for k, name in enumerate(names)}
     lines = [line for line, _ in rows]
@@ -116,9 +135,10 @@ def read_states(
     texts_of = {name: [values[k] for k in order] for name, values in texts_of.items()}
     role = _roles(path, lines, texts_of)
     cells = {n: texts_of[n] for n in names if n not in ("state", "role", "file")}
-    decimal_commas = delimiter == ";" and any("," in text for texts in cells.values() for text in texts)
+    decimal_commas = delimiter != "," and any("," in text for texts in cells.values() for text in texts)
     numbers = {n: _numbers(path, lines, n, texts, role, decimal_commas) for n, texts in cells.items()}
-    turned = [n for n in names if n not in KNOWN and not n.startswith(CHANNEL_PREFIX)]
+    numbers |= {MILLI[n]: numbers.pop(n) / 1000 for n in tuple(numbers) if n in MILLI}
+    turned = [n for n in numbers if not _is_known(n, n, ())]
     if radians:
         numbers.update({n: np.rad2deg(numbers[n]) for n in turned})
     files = _files(path, lines, texts_of["file"]) if "file" in texts_of else None
@@ -137,34 +157,57 @@ def read_states(
         sigma=numbers.get("sigma"),
         files=files,
         channels={n.removeprefix(CHANNEL_PREFIX): v for n, v in numbers.items() if n.startswith(CHANNEL_PREFIX)},
+        ignored={name: [cells[k] for k in order] for name, cells in ignored.items()},
     )
 
 
-def _no_table(arrays: Mapping[str, NDArray[np.float64]]) -> tuple[list[str], list[Row], str]:
-    """Rows without columns, one for each number of the first array."""
-    if not arrays:
-        raise ImportFailed("no states: give --states FILE.csv, or the angles of each axis as --columns AXIS=FILE::NAME")
-    return [], [(k + 1, []) for k in range(len(next(iter(arrays.values()))))], ","
+def _rows_without_table(known: Mapping[str, NDArray[np.float64]], count: int | None) -> list[Row]:
+    """Rows without columns, one for each number of the first array, or `count`."""
+    if known:
+        count = len(next(iter(known.values())))
+    if count is None:
+        raise ImportFailed(
+            "no states: give --states FILE.csv, the angles of each axis as --columns AXIS=FILE::NAME, or frames that "
+            "have them in their names as --stack 'FOLDER/name_{AXIS}.tif'"
+        )
+    return [(k + 1, []) for k in range(count)]
 
 
 def _mapped(
     path: Path, header: list[str], rows: list[Row], mapping: Mapping[str, str], axes: Sequence[str]
-) -> tuple[list[str], list[Row]]:
-    """The columns that have a name here: by the mapping, or already in the file."""
+) -> tuple[list[str], list[Row], dict[str, list[str]]]:
+    """The columns that have a name here, by the mapping or already in the file; and the others."""
+    in_order = mapping.get("state") == IN_ORDER and IN_ORDER not in header
+    mapping = {name: text for name, text in mapping.items() if not (in_order and name == "state")}
     absent = [text for text in mapping.values() if text not in header]
     if absent:
         raise ImportFailed(f"{path}:1: no column {absent[0]!r}. Found: {', '.join(header)}")
     named = {text: name for name, text in mapping.items()}
-    kept = [
-        (k, named.get(h, h))
-        for k, h in enumerate(header)
-        if h in named or (_axis_name(h) not in mapping and _is_known(h, _axis_name(h), axes))
-    ]
+    kept, ignored = [], {}
+    for k, h in enumerate(header):
+        of_file = _axis_name(h) not in mapping and _is_known(h, _axis_name(h), axes)
+        if h in named or (of_file and not (in_order and h == "state")):
+            kept.append((k, named.get(h, h)))
+        else:
+            ignored[h] = [row[k] for _, row in rows]
     header, rows = [h for _, h in kept], [(line, [row[k] for k, _ in kept]) for line, row in rows]
-    if "state" not in header:
-        header, rows = ["state", *header], [(line, [str(k), *row]) for k, (line, row) in enumerate(rows)]
+    if "state" not in header and not in_order and "file" not in header:
+        _require_in_order(path, ignored)
     # An axis has the ending that tells it from a column that is not known.
-    return [f"{h}_deg" if h in mapping and not _is_known(h, h, axes) else h for h in header], rows
+    return [f"{h}_deg" if h in mapping and not _is_known(h, h, axes) else h for h in header], rows, ignored
+
+
+def _require_in_order(path: Path, ignored: Mapping[str, list[str]]) -> None:
+    """Raise ImportFailed where a column that is not used numbers the rows in another order than theirs."""
+    for name, cells in ignored.items():
+        if not all(c.isascii() and c.isdecimal() and len(c) < 10 for c in cells):
+            continue
+        numbers = [int(c) for c in cells]
+        if numbers != sorted(numbers) and sorted(numbers) == list(range(min(numbers), max(numbers) + 1)):
+            raise ImportFailed(
+                f"{path}: column {name!r} numbers the rows from {numbers[0]} to {numbers[-1]} in another order. If it "
+                f"has the order of the frames, add --columns 'state={name}', else --columns state={IN_ORDER}"
+            )
 
 
 def _with_arrays(
@@ -174,21 +217,35 @@ def _with_arrays(
     for name, values in arrays.items():
         if len(values) != len(rows):
             raise ImportFailed(f"--columns {name}: {len(values)} numbers for {len(rows)} states of {path}")
-        header = [*header, name if name in KNOWN or name.startswith(CHANNEL_PREFIX) else f"{name}_deg"]
+        header = [*header, name if _is_known(name, name, ()) else f"{name}_deg"]
         rows = [(line, [*row, repr(float(v))]) for (line, row), v in zip(rows, values, strict=True)]
     return header, rows
 
 
 def _table(path: Path) -> tuple[list[str], list[Row], str]:
     """Header, rows with their line numbers, and what stands between the columns."""
-    text = read_text(path, ImportFailed)
-    delimiter = max(DELIMITERS, key=text.partition("\n")[0].count)
+    text_lines = read_text_of_any_system(path, ImportFailed).splitlines(keepends=True)
+    first = next((k for k, line in enumerate(text_lines) if line.strip() and not line.startswith("#")), 0)
+    if first and _is_all_numbers(text_lines[first]):
+        # As numpy writes a table: its names are a comment.
+        first -= 1
+        text_lines[first] = text_lines[first].lstrip("# ")
+    title = text_lines[first] if text_lines else ""
+    delimiter = max(DELIMITERS, key=title.count)
+    if delimiter not in title and len(text_lines) > first + 1 and len(text_lines[first + 1].split()) > 1:
+        delimiter = " "
+        text_lines = [" ".join(line.split()) + "\n" for line in text_lines]
     try:
-        reader = csv.reader(text.splitlines(keepends=True), delimiter=delimiter)
+        reader = csv.reader(text_lines[first:], delimiter=delimiter)
         header = [h.strip() for h in next(reader, [])]
-        rows = [(reader.line_num, [c.strip() for c in row]) for row in reader if any(c.strip() for c in row)]
+        rows = [(first + reader.line_num, [c.strip() for c in row]) for row in reader if any(c.strip() for c in row)]
     except csv.Error as error:
         raise ImportFailed(f"{path}: is not a CSV text file ({error})") from error
+    if header and all(_is_number(h) for h in header):
+        raise ImportFailed(
+            f"{path}: has no line with the names of its columns. Without --states, name each column by its number, as "
+            f"--columns 'psg={path}[0]'"
+        )
     if not header or not rows:
         raise ImportFailed(f"{path}: needs a header line and one row per state; found {len(rows)} rows")
     if len(header) > MOST_COLUMNS or len(rows) > MOST_STATES:
@@ -198,7 +255,33 @@ def _table(path: Path) -> tuple[list[str], list[Row], str]:
     for line, row in rows:
         if len(row) != len(header):
             raise ImportFailed(f"{path}:{line}: {len(row)} columns, the header has {len(header)}")
-    return header, rows, delimiter
+    # Spreadsheets write delimiters behind the last column.
+    used = [k for k, h in enumerate(header) if h or any(row[k] for _, row in rows)]
+    return [header[k] for k in used], [(line, [row[k] for k in used]) for line, row in rows], delimiter
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _is_all_numbers(line: str) -> bool:
+    parts = re.split(r"[;\t ]+|,\s*", line.strip())
+    return all(_is_number(part) for part in parts if part)
+
+
+def _require_columns(path: Path, header: list[str], names: list[str], axes: Sequence[str]) -> None:
+    """Raise ImportFailed where a column is missing."""
+    missing = [n for n in axes if n not in names]
+    if missing:
+        found = one_line(", ".join(h for h in header if h != "state")) or "none"
+        raise ImportFailed(
+            f"{path}:1: no column {', '.join(missing)}. Found: {found}. Say which column has the angles of each axis: "
+            + " ".join(f"--columns '{name}=COLUMN'" for name in missing)
+        )
 
 
 def _check_names(path: Path, names: Sequence[str]) -> None:
@@ -211,7 +294,7 @@ def _check_names(path: Path, names: Sequence[str]) -> None:
 
 
 def _is_known(header: str, name: str, axes: Sequence[str]) -> bool:
-    return name in KNOWN or name in axes or name.startswith(CHANNEL_PREFIX) or header.endswith("_deg")
+    return name in KNOWN or name in MILLI or name in axes or name.startswith(CHANNEL_PREFIX) or header.endswith("_deg")
 
 
 def _check_above_zero(path: Path, lines: list[int], name: str, values: NDArray[np.float64] | None) -> None:
@@ -243,18 +326,21 @@ def _order(path: Path, lines: list[int], states: list[str]) -> list[int]:
     first, last = min(seen), max(seen)
     if last - first + 1 != len(seen):
         missing = next(number for number in range(first, last) if number not in seen)
-        raise ImportFailed(f"{path}: state {missing} is missing between {first} and {last}; number them without gaps")
+        raise ImportFailed(
+            f"{path}: state {missing} is missing between {first} and {last}. If it was not measured, add "
+            f"--columns state={IN_ORDER}"
+        )
     return sorted(range(len(states)), key=lambda k: int(states[k]))
 
 
-def _files(path: Path, lines: list[int], names: list[str]) -> tuple[Path, ...]:
+def _files(path: Path, lines: list[int], names: list[str]) -> tuple[str, ...]:
     line_of: dict[str, int] = {}
     for line, name in zip(lines, names, strict=True):
         if not name or "\0" in name:
             raise ImportFailed(f"{path}:{line}: column file: {'no name' if not name else 'not a name of a file'}")
         if line_of.setdefault(name, line) != line:
             raise ImportFailed(f"{path}:{line}: column file: {one_line(name)} is given already in line {line_of[name]}")
-    return tuple(path.parent / name for name in names)
+    return tuple(names)
 
 
 def _roles(path: Path, lines: list[int], columns: dict[str, list[str]]) -> tuple[str, ...]:
