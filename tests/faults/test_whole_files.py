@@ -17,7 +17,7 @@ from processing.whole_file import whole_file, write_new_text, write_whole_text
 
 SHAPE = (20, 30)
 WRITERS = {
-    **{to: ("export", "--to", to) for to in ("csv", "tiff", "mat", "fits", "png", "pdf")},
+    **{to: ("export", "--to", to) for to in ("csv", "tiff", "mat", "fits", "png")},
     "html": ("report",),
 }
 ENDINGS = {"tiff": ".mueller.tif"}
@@ -54,7 +54,7 @@ def full_disc(most_bytes=1000):
 def test_a_full_disc_leaves_nothing_half(product, kind, there, tmp_path, capsys):
     command, *options = WRITERS[kind]
     out = tmp_path / f"out{ENDINGS.get(kind, f'.{kind}')}"
-    planes = [] if kind in ("html", "png", "pdf") else ["--plane", "mueller"]
+    planes = [] if kind in ("html", "png") else ["--plane", "mueller"]
     if there:
         out.write_text("of yesterday")
     words = [command, str(product), *options, *planes, "--out", str(tmp_path / f"out.{kind}"), "--overwrite"]

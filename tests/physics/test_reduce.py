@@ -250,41 +250,6 @@ def test_read_back_angles_count_and_not_the_planned_ones(rgb950: InstrumentModel
     np.testing.assert_allclose(image.values, m, atol=3e-3)
 
 
-def test_interrupted_reduction_goes_on_and_equals_an_uninterrupted_one(
-    rgb950: InstrumentModel, synthetic_capture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("processing.reduction.mueller.BLOCK_PIXELS", 4 * 8)
-    rng = np.random.default_rng(10)
-    frames = noisy(rng, signals(rgb950, table(), scene(rng, (24, 8))))
-    path = synthetic_capture(frames, table(), detector=detector())
-    whole = reduced(path, rgb950)
-    out, seen = path.with_name("again.h5"), []
-
-    def stop(done: int, total: int) -> None:
-        seen.append(done)
-        if done == 12:
-            raise KeyboardInterrupt
-
-    with Capture(path) as capture, pytest.raises(KeyboardInterrupt):
-        reduce_mueller(capture, rgb950, out, (STEP,), progress=stop)
-    assert not out.exists()
-    read: list[slice] = []
-    real = Capture.read_block
-
-    def watched(self: Capture, states: np.ndarray, rows: slice, block: np.ndarray) -> None:
-        read.append(rows)
-        real(self, states, rows, block)
-
-    monkeypatch.setattr(Capture, "read_block", watched)
-    with Capture(path) as capture:
-        reduce_mueller(capture, rgb950, out, (STEP,))
-    assert min(rows.start for rows in read) == 12
-    again = MuellerImage.load(out)
-    np.testing.assert_array_equal(again.values, whole.values)
-    np.testing.assert_array_equal(again.errors, whole.errors)
-    assert again.facts == whole.facts
-
-
 def test_product_keeps_origin_and_says_simulated(rgb950: InstrumentModel, synthetic_capture) -> None:
     path = synthetic_capture(signals(rgb950, table(), scene(np.random.default_rng(11), (4, 6))), table(), omega_deg=35)
     out = path.with_suffix(".product.h5")
@@ -354,9 +319,20 @@ def test_killed_reduction_leaves_a_partial_file_that_is_resumed(
         done = int(h5["entry/rows_done"][()])
     assert 30 <= done < 160
     monkeypatch.setattr("processing.reduction.mueller.BLOCK_PIXELS", 4 * 8)
-    with Capture(path) as capture:
+    read: list[int] = []
+    real = Capture.read_block
+
+    def watched(self: Capture, states: np.ndarray, rows: slice, block: np.ndarray) -> None:
+        read.append(rows.start)
+        real(self, states, rows, block)
+
+    with monkeypatch.context() as patch, Capture(path) as capture:
+        patch.setattr(Capture, "read_block", watched)
         reduce_mueller(capture, rgb950, out, (STEP,))
+    assert min(read) == done
     whole = reduced(path, rgb950)
     again = MuellerImage.load(out)
     np.testing.assert_array_equal(again.values, whole.values)
+    np.testing.assert_array_equal(again.errors, whole.errors)
     np.testing.assert_array_equal(again.mask, whole.mask)
+    assert again.facts == whole.facts
