@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import ipaddress
 import socket
@@ -9,12 +10,15 @@ import struct
 import warnings
 from typing import Any
 
+from drivers.clock import REAL
 from drivers.errors import CameraBusy, CameraError, CameraNotFound
 
 _SIOCGIFADDR = 0x8915
 _SIOCGIFMTU = 0x8921
 # GigE Vision bootstrap register: address of the application that controls the camera (optional for cameras).
 _PRIMARY_APPLICATION_IP = 0x0A14
+# A camera frees itself when it has heard nothing for its heartbeat's time: 3 s, unless a program sets another.
+_FREES_ITSELF_S = 5.0
 
 
 def load_aravis() -> tuple[Any, Any]:
@@ -67,6 +71,8 @@ def list_cameras(aravis: Any) -> list[dict[str, str]]:
 def open_camera(name: str, device: str | None, aravis: Any, glib_error: Any) -> Any:
     """Open a camera by id, serial number or IP address and take control of it.
 
+    A camera whose program was killed is waited for, until it frees itself.
+
     Parameters
     ----------
     name : str
@@ -91,11 +97,12 @@ def open_camera(name: str, device: str | None, aravis: Any, glib_error: Any) -> 
     except glib_error as error:
         raise _not_found(name, device, list_cameras(aravis), str(error.message)) from error
     link = camera.get_device()
-    if isinstance(link, aravis.GvDevice) and not link.is_controller():
+    if isinstance(link, aravis.GvDevice) and not _control(link, glib_error):
         raise CameraBusy(
             f"open camera {name} ({key})",
             f"{_holder(link, glib_error)} controls it already",
-            "Close the other program; after a crash a camera frees itself within some seconds",
+            f"It was asked for {_FREES_ITSELF_S:.0f} s, in which a camera frees itself after a crash. "
+            "Close the other program",
         )
     return camera
 
@@ -117,6 +124,16 @@ def _not_found(name: str, device: str | None, found: list[dict[str, str]], detai
         if not found
         else "Set `device` in the rig file to one of those",
     )
+
+
+def _control(link: Any, glib_error: Any) -> bool:
+    """Take control, at once or when the camera no longer hears of who had it."""
+    until_s = REAL.now_s() + _FREES_ITSELF_S
+    while not link.is_controller() and REAL.now_s() < until_s:
+        with contextlib.suppress(glib_error):
+            link.take_control()
+        REAL.sleep_s(0.1)
+    return bool(link.is_controller())
 
 
 def _holder(link: Any, glib_error: Any) -> str:

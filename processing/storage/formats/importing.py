@@ -114,6 +114,7 @@ def understand(request: ImportRequest) -> Understood:
         source=request.stack or "frames",
     )
     require_unit(states, request.columns, request.angles)
+    _require_one_source(request, states, has_folder=bool(places or found))
     if states.files is not None:
         folder = states.path.parent
         if found is None:
@@ -143,6 +144,18 @@ def _count(stack: str, channels: int) -> int:
     """States of a stack in which nothing turns."""
     shape = open_stack(stack, None).shape
     return int(shape[0]) if len(shape) == 4 or (len(shape) == 3 and channels == 1) else 1
+
+
+def _require_one_source(request: ImportRequest, states: StatesFile, *, has_folder: bool) -> None:
+    given = {
+        "the column `file`": states.files is not None,
+        "--stack": request.stack is not None and (states.files is None or not has_folder),
+        "columns `channel_<name>`": bool(states.channels),
+    }
+    ways = [name for name, present in given.items() if present]
+    if len(ways) != 1:
+        found = " and ".join(ways) or "none of them"
+        raise ImportFailed(f"{states.path}: frames come from exactly one of {', '.join(given)}; found {found}.")
 
 
 def _plain(name: str) -> str:
@@ -253,15 +266,6 @@ def _write(
 def _source(
     request: ImportRequest, states: StatesFile, places: tuple[Place, ...], names: tuple[str, ...], has_model: bool
 ) -> FrameSource:
-    given = {
-        "the column `file`": states.files is not None,
-        "--stack": request.stack is not None and (states.files is None or not places),
-        "columns `channel_<name>`": bool(states.channels),
-    }
-    ways = [name for name, present in given.items() if present]
-    if len(ways) != 1:
-        found = " and ".join(ways) or "none of them"
-        raise ImportFailed(f"{states.path}: frames come from exactly one of {', '.join(given)}; found {found}.")
     if states.channels:
         return _fluxes(states, names if has_model else tuple(states.channels))
     if places:
