@@ -84,6 +84,11 @@ def open_plain(path: Path, flags: int) -> int:
     return file
 
 
+def make_plain(path: Path) -> None:
+    """Make a file of one's own for what is appended later, or leave it as it is. Raises as `open_plain`."""
+    os.close(open_plain(path, os.O_WRONLY))
+
+
 def write_whole_text(path: Path, text: str, *, follow: bool = True) -> None:
     """Write text as UTF-8, wholly or not at all. Raises OSError."""
     with whole_file(path, follow=follow) as new:

@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from acquisition.screen.run_file import begun_ticks
+from drivers.log_process import start_appending
 from processing.doors import read_json
 from processing.errors import ProcessError
 from viewer.library import OWN, NotHere
@@ -33,6 +34,8 @@ MODULES = {
 }
 #: Characters of the output that a page shows, from its end.
 SHOWN = 20_000
+#: Longest wait for the end of the output once a command has ended.
+OUTPUT_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -79,11 +82,14 @@ class Jobs:
         environment = {k: v for k, v in os.environ.items() if k != "HDF5_USE_FILE_LOCKING"}
         # Plain text of any width, as into a file.
         environment |= {"PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "UMOV_DOOR": os.environ.get("UMOV_DOOR", "./lab")}
-        with (folder / "output.txt").open("wb") as output:
+        # Through a pipe: a program that writes to a hanging disc can neither measure nor end.
+        output = start_appending(folder / "output.txt")
+        assert output.stdin is not None
+        with output.stdin as pipe:
             process = subprocess.Popen(
                 [sys.executable, "-m", MODULES[command[0]], *command[1:]],
                 stdin=subprocess.DEVNULL,
-                stdout=output,
+                stdout=pipe,
                 stderr=subprocess.STDOUT,
                 cwd=cwd,
                 env=environment,
@@ -92,12 +98,15 @@ class Jobs:
             )
         job = Job(name, title, tuple(command), about, time.time(), process.pid, begun_ticks(process.pid))
         (folder / "job.json").write_text(json.dumps(asdict(job)), encoding="utf-8")
-        threading.Thread(target=self._wait, args=(process, folder), name=f"job {name}", daemon=True).start()
+        threading.Thread(target=self._wait, args=(process, output, folder), name=f"job {name}", daemon=True).start()
         return job
 
     @staticmethod
-    def _wait(process: subprocess.Popen[bytes], folder: Path) -> None:
+    def _wait(process: subprocess.Popen[bytes], output: subprocess.Popen[bytes], folder: Path) -> None:
         code = process.wait()
+        # A command that it has started may hold the pipe for longer.
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            output.wait(OUTPUT_S)
         with contextlib.suppress(OSError):
             (folder / "code").write_text(str(code), encoding="utf-8")
 

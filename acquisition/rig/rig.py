@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from acquisition.cleanup import Step, run_all
+from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError
 from acquisition.rig.alarms import ACKNOWLEDGE
 from acquisition.rig.config import RigConfig, clock_of
@@ -28,6 +29,7 @@ from drivers.registry import open_axis, open_camera, open_source
 from drivers.serial_link import LineRegistry
 from drivers.sources.manual import Ask, ManualSource
 from processing.instrument.model import InstrumentModel
+from processing.whole_file import make_plain
 
 log = logging.getLogger(__name__)
 
@@ -172,8 +174,20 @@ class Rig(JointAxes):
         Parameters
         ----------
         journal : the file that the guard appends to, or None.
+
+        Raises
+        ------
+        AcquisitionError
+            Something else than a file of its own is there, or the disc takes none.
         """
         if self._guarding is None:
+            if journal is not None:
+                try:
+                    on_disc(f"look at {journal}", make_plain, journal)
+                except OSError as error:
+                    raise AcquisitionError(
+                        f"{journal} cannot be written ({error.strerror}). Remove it, or give another folder with --out."
+                    ) from error
             self._guarding = Guarding(
                 self.config, journal, self._lines.descriptors(), self._shut_at_once, self._guard_says
             )

@@ -17,6 +17,7 @@ from acquisition.rig.config import load_rig
 from acquisition.rig.open_rig import open_rig
 from processing.storage.captures.capture import Capture
 from simulators.rig.served_rig import serve
+from viewer.jobs import Jobs
 
 
 def _children(pid):
@@ -28,6 +29,10 @@ def _disc_process(pid):
     own = Path(f"/proc/{pid}/cmdline").read_bytes()
     (found,) = [child for child in _children(pid) if Path(f"/proc/{child}/cmdline").read_bytes() == own]
     return found
+
+
+def _command(pid):
+    return Path(f"/proc/{pid}/cmdline").read_text()
 
 
 def _open_files(pid):
@@ -113,23 +118,33 @@ def test_a_capture_goes_on_in_a_new_run_when_the_disc_process_was_killed(begun, 
     assert not simulation.light()
 
 
+def test_a_command_that_a_page_starts_has_its_output_written_by_another(tmp_path):
+    jobs, seen = Jobs(tmp_path), set()
+    job = jobs.start("move", ["acquire", "move", "psg", "90"], {}, tmp_path)
+    while jobs.running(job):
+        with contextlib.suppress(FileNotFoundError):
+            seen.update(_open_files(job.pid))
+    _wait_for(lambda: jobs.code(job) == 0)
+    assert "psg at 90" in jobs.output(job)
+    assert seen
+    assert not [path for path in seen if tmp_path in path.parents]
+
+
 @pytest.mark.timeout(120)
 def test_a_wire_log_on_a_disc_that_hangs_holds_up_no_light(small_rig, tmp_path):
-    """A pipe that nobody reads takes 64 KiB; a write to it waits for ever then, as for a disc that hangs."""
+    """The process that writes the log is stopped: its pipe takes 64 KiB, and a write waits for ever then."""
     small_rig("rig.yaml", top={"settle_s": 0.0})
     with serve(tmp_path / "rig.yaml", tmp_path / "served.yaml", "red_sphere") as simulation:
         config = load_rig(tmp_path / "served.yaml").model_copy(update={"wire_log": tmp_path / "wire"})
-        with open_rig(config, with_camera=False):
-            pass
-        for log in (tmp_path / "wire").iterdir():
-            log.unlink()
-            os.mkfifo(log)
-        readers = [os.open(log, os.O_RDWR) for log in (tmp_path / "wire").iterdir()]
         with open_rig(config, with_camera=False) as rig:
+            hung = [child for child in _children(os.getpid()) if str(tmp_path / "wire") in _command(child)]
+            assert hung
+            for child in hung:
+                os.kill(child, signal.SIGSTOP)
             rig.source.set_light(True)
-            for _ in range(500):
+            for _ in range(1000):
                 rig.source.is_on()
             rig.source.set_light(False)
             assert simulation.light() == 0
-        for reader in readers:
-            os.close(reader)
+        for child in hung:
+            os.kill(child, signal.SIGCONT)

@@ -3,11 +3,13 @@
 import json
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 
 import pytest
 
+from acquisition.errors import AcquisitionError
 from acquisition.rig import alarms
 from acquisition.rig.config import load_rig
 from acquisition.rig.guard import Guard, with_held_ports
@@ -95,8 +97,9 @@ def _guard_of(rig):
 def test_no_light_before_a_guard_watches_and_the_light_goes_off_with_the_guard(watched_rig):
     rig, simulation, _ = watched_rig
     rig.source.set_light(True)
-    assert "guard watches" in (served_journal := Path(rig._guarding._journal)).read_text(), served_journal
     assert _lit(simulation)
+    journal = Path(rig._guarding._journal)
+    _until(lambda: journal.exists() and "guard watches" in journal.read_text())
     for number, kind in enumerate((signal.SIGKILL, signal.SIGSTOP), start=1):
         before = _guard_of(rig)
         os.kill(before, kind)
@@ -169,24 +172,27 @@ def test_a_guard_writes_to_a_port_that_somebody_holds(watched_rig):
 
 def test_all_that_was_noted_is_in_the_file_when_the_journal_is_closed(tmp_path, monkeypatch):
     """The process that writes may begin late on a busy machine; a guard that has ended has its last line written."""
-    late = tmp_path / "dd"
-    late.write_text('#!/bin/sh\nsleep 0.3\nexec /usr/bin/dd "$@"\n')
+    late = tmp_path / "late"
+    late.write_text(f'#!/bin/sh\nsleep 0.3\nexec {sys.executable} "$@"\n')
     late.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(sys, "executable", str(late))
     journal = Journal(tmp_path / "guard.jsonl")
     journal.note("guard rests")
     journal.close()
     assert "guard rests" in (tmp_path / "guard.jsonl").read_text()
 
 
-def test_a_link_in_the_place_of_the_journal_is_not_followed(tmp_path):
+@pytest.mark.parametrize("link", [Path.symlink_to, Path.hardlink_to])
+def test_a_link_in_the_place_of_the_journal_is_not_followed(served, tmp_path, link):
     """The folder of the captures may be somebody else's."""
     (tmp_path / "victim").write_text("precious")
-    (tmp_path / "guard.jsonl").symlink_to("victim")
+    link(tmp_path / "guard.jsonl", tmp_path / "victim")
     journal = Journal(tmp_path / "guard.jsonl")
     journal.note("guard watches")
     journal.close()
     assert (tmp_path / "victim").read_text() == "precious"
+    with pytest.raises(AcquisitionError, match=r"guard.jsonl cannot be written"):
+        open_rig(load_rig(served[1])).start_guard(tmp_path / "guard.jsonl")
 
 
 def test_acknowledge_is_a_command(acquire, monkeypatch, tmp_path):
