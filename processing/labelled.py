@@ -27,6 +27,12 @@ def open_dataset(path: Path | str) -> xr.Dataset:
     each axis, as read back. A product has its planes, (row, column, y, x) for Mueller matrices; `NAME_errors` are
     standard errors. Every variable has `units` and `long_name`; attributes hold title, wavelength, Omega, and whether
     the data are simulated.
+
+    Examples
+    --------
+    >>> counts = open_dataset("sphere.h5").counts
+    >>> dict(counts.sizes), counts.units
+    ({'state': 42, 'channel': 1, 'y': 24, 'x': 32}, 'count')
     """
     path = Path(path)
     return _of_product(path) if is_product(path) else _of_capture(path)
@@ -56,11 +62,15 @@ def open_campaign(folder: Path | str, kind: str = "mueller") -> xr.Dataset:
 
     Examples
     --------
-    The median of m11 over the arm angle::
+    The median of m11 over the arm angle:
 
-        stack = open_campaign("captures")
-        m11 = stack.mueller.sel(row=1, column=1) / stack.mueller.sel(row=0, column=0)
-        print(m11.median(["y", "x"]).squeeze().to_series())
+    >>> for name in ("sphere.h5", "sphere_60.h5"):
+    ...     _ = Reduction(name).make()
+    >>> stack = open_campaign(".")
+    >>> m11 = stack.mueller.sel(row=1, column=1) / stack.mueller.sel(row=0, column=0)
+    >>> median = m11.median(["y", "x"]).squeeze()
+    >>> median.dims, median.omega.values.tolist()
+    (('omega',), [35.0, 60.0])
     """
     import xarray as xr
 
@@ -157,6 +167,12 @@ def reduce_to_dataset(capture: Path | str, instrument: Path | str | None = None,
     ------
     ProcessError
         What `process reduce` would say.
+
+    Examples
+    --------
+    >>> image = reduce_to_dataset("sphere.h5", weighted=True)
+    >>> image.mueller.dims, image.mueller_errors.units
+    (('row', 'column', 'y', 'x'), 'count')
     """
     step = Reduction(Path(capture), Path(instrument) if instrument else None, **options)
     with tempfile.TemporaryDirectory() as folder:
@@ -173,6 +189,20 @@ def write_dataset(dataset: xr.Dataset, path: Path | str) -> Path:
     ------
     ProcessError
         The file exists, or something needed is missing.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> angle = np.arange(0, 360, 9.0)
+    >>> frames = np.full((40, 1, 8, 12), 900, np.uint16)
+    >>> turned = {"psg_deg": ("state", angle), "psa_deg": ("state", 5 * angle)}
+    >>> made = xr.Dataset(
+    ...     {"counts": (("state", "channel", "y", "x"), frames)} | turned,
+    ...     attrs={"wavelength_nm": 532, "title": "white card"},
+    ... )
+    >>> print(write_dataset(made, "card.h5"))
+    card.h5
     """
     path = Path(path)
     require_new(path)

@@ -197,6 +197,13 @@ def free_design(
     ------
     ProcessError
         Nothing turns, or too few states for what the instrument can determine.
+
+    Examples
+    --------
+    >>> model = InstrumentModel.load("instrument.yaml").at(662)
+    >>> design = free_design(model, states=16)
+    >>> design.rank, design.angles_deg["psg"].shape
+    (16, (16,))
     """
     if not model.axes:
         raise ProcessError(f"no element of {model.name!r} turns, so there are no states to choose.")

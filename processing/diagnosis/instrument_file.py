@@ -72,6 +72,14 @@ def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis, n
         There is nothing to write, or more than an instrument file may hold.
     ProcessError
         The file exists.
+
+    Examples
+    --------
+    >>> model = InstrumentModel.load("instrument.yaml")
+    >>> judged, _ = diagnose_captures(["air.h5"], model)
+    >>> write_instrument(Path("corrected.yaml"), model, judged.diagnosis, note="air of today")
+    >>> [effect.kind for effect in InstrumentModel.load("corrected.yaml").effects]
+    ['psg_azimuth']
     """
     if not diagnosis.corrects and not diagnosis.systematic():
         if diagnosis.correction is not None and diagnosis.correction.refused is not None:

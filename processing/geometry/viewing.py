@@ -23,6 +23,12 @@ class ViewingGeometry(BaseModel):
     """Where camera, source and object stand. The source's distance is from the centre of rotation.
 
     `arm_zero_deg` is what has to be added to the arm's reading (`diagnose --reflectance` finds it).
+
+    Examples
+    --------
+    >>> geometry = ViewingGeometry.load("geometry.yaml")
+    >>> geometry.shape.radius_mm, geometry.source_distance_mm
+    (12.7, 672.7)
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -68,6 +68,12 @@ class InstrumentModel(Part):
     `systematic` is what `diagnose` leaves uncertain. `process reduce` carries both into its error bars.
     Where two channels or more see one source, its level in each state is projected out; `free_source: false` says
     that it has the same level in all states.
+
+    Examples
+    --------
+    >>> model = InstrumentModel.load("instrument.yaml").at(662)
+    >>> model.axes, model.rows({"psg": [0, 9], "psa": [0, 45]}).shape
+    (('psa', 'psg'), (2, 1, 16))
     """
 
     kind: Literal["instrument"] = "instrument"

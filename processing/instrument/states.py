@@ -28,6 +28,14 @@ class StateTable:
     exposure_s : array (N,), seconds.
     role : tuple of N roles.
     repeats : array (N,), frames averaged for the state.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> psg = np.arange(0, 27, 9.0)
+    >>> table = StateTable.of_angles({"psg": psg, "psa": 5 * psg}, exposure_s=0.02)
+    >>> table.role, table.angles_deg["psa"].tolist()
+    (('sample', 'sample', 'sample'), [0.0, 45.0, 90.0])
     """
 
     angles_deg: Mapping[str, NDArray[np.float64]]
@@ -78,6 +86,12 @@ def rotating_retarders(
         Frames averaged for each state.
     axes
         Names of the generator's and the analyzer's axis.
+
+    Examples
+    --------
+    >>> table = rotating_retarders(0.02, states=3, ratio=5)
+    >>> table.angles_deg["psg"].tolist(), table.angles_deg["psa"].tolist()
+    ([0.0, 9.0, 18.0], [0.0, 45.0, 90.0])
     """
     sample: Role = "sample"
     psg = step_deg * np.arange(states, dtype=float)

@@ -48,6 +48,12 @@ def cloude(m: RealArray) -> Cloude:
 
     Values and NaN as in `coherency_eigenvalues`. Where eigenvalues are equal their matrices are one choice of
     many (any basis of their common space); an exact ideal depolarizer has none and gets NaN.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> cloude(np.diag([1, 0.5, 0.5, 0.5])).eigenvalues.round(3).tolist()
+    [0.625, 0.125, 0.125, 0.125]
     """
     planar, shape = as_planar(m)
     xi = np.empty((4, planar.shape[1]), planar.dtype)
@@ -75,6 +81,13 @@ def xi0_and_dominant(m: RealArray, out: tuple[RealArray, RealArray] | None = Non
     xi0 : (...), same type. 1 for a Mueller-Jones matrix, 1/4 for the ideal depolarizer.
     mueller_jones : (..., 4, 4), m00 = 1. NaN where m00 <= 0 or an element is not finite, and for an exact ideal
         depolarizer, which has no dominant process.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> xi0, process = xi0_and_dominant(np.diag([1, 0.5, 0.5, 0.5]))
+    >>> float(xi0), np.diag(process).round(6).tolist()
+    (0.625, [1.0, 1.0, 1.0, 1.0])
     """
     planar, shape = as_planar(m)
     if out is None:

@@ -87,7 +87,13 @@ def kinds() -> dict[str, type[BaseModel]]:
 
 
 def load_reflectance(path: Path | str) -> Any:
-    """The ReflectanceModel that a material file describes. Raises ConfigError with file, line and key."""
+    """The ReflectanceModel that a material file describes. Raises ConfigError with file, line and key.
+
+    Examples
+    --------
+    >>> load_reflectance("material.yaml").name
+    'red 3D print'
+    """
     header = load_yaml(path, _Header)
     model = _model_here(header.kind) or kinds().get(header.kind)
     if model is None:

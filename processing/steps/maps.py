@@ -27,6 +27,11 @@ class Quantities(FileStep):
         Decompositions besides: "symmetric", "differential".
     pairs
         Name of a map to the states of two polarizers: light that passes both, over m00.
+
+    Examples
+    --------
+    >>> print(Quantities(Reduction("sphere.h5").make()).make())
+    sphere.quantities.h5
     """
 
     source: Path
@@ -59,6 +64,11 @@ class Xi0(FileStep):
         Mueller or Stokes product.
     geometry, material
         Files of camera, source and shape, and of the dominant process: for a source with less than whole matrices.
+
+    Examples
+    --------
+    >>> print(Xi0(Reduction("sphere.h5").make()).make())
+    sphere.xi0.h5
     """
 
     source: Path
@@ -115,6 +125,12 @@ class Extrapolation(FileStep):
         Stokes product.
     geometry, material
         Files of camera, source and shape, and of the dominant process.
+
+    Examples
+    --------
+    >>> stokes = Reduction("mosaic.h5").make()
+    >>> print(Extrapolation(stokes, "geometry.yaml", "material.yaml").make())
+    mosaic.extrapolated.h5
     """
 
     source: Path

@@ -48,6 +48,14 @@ class MaterialFitting(OfFiles):
         Of the material, for its file.
     correlation
         See `processing.reflectance.material_fit.fit_values`.
+
+    Examples
+    --------
+    >>> fitted = MaterialFitting((Reduction("sphere.h5").make(),), "geometry.yaml").fitted()
+    >>> n, k = fitted.fit.constants[:2]
+    >>> u_n = fitted.fit.covariance[0, 0] ** 0.5
+    >>> bool(abs(n - 1.30) < 4 * u_n)
+    True
     """
 
     sources: tuple[Path, ...]

@@ -43,6 +43,11 @@ class Reduction(FileStep):
         Result of `diagnose --json`: states, struck intensities and bad pixels that it names are left out.
     demosaic, analyzers
         Method (None: the default) and analysis vectors of the pixels; for a mosaic capture.
+
+    Examples
+    --------
+    >>> print(Reduction("sphere.h5", weighted=True).make("weighted.h5"))
+    weighted.h5
     """
 
     capture: Path

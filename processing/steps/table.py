@@ -30,6 +30,12 @@ class Tabulation(FileStep):
         The table; it has no other usual name.
     layout
         Of the bins.
+
+    Examples
+    --------
+    >>> image = Reduction("sphere.h5").make()
+    >>> print(Tabulation((image,), "geometry.yaml", "table.h5").make())
+    table.h5
     """
 
     sources: tuple[Path, ...]

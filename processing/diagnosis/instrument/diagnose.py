@@ -301,6 +301,12 @@ def diagnose_captures(
     ------
     CaptureError
         A file cannot be used, or none is given.
+
+    Examples
+    --------
+    >>> judged, _ = diagnose_captures(["air.h5"], InstrumentModel.load("instrument.yaml"))
+    >>> [(effect.kind, effect.element) for effect in judged.diagnosis.effects]
+    [('psg_azimuth', 'psg_retarder')]
     """
     if not captures:
         raise CaptureError("no capture to diagnose: one file or several of one instrument are wanted")

@@ -37,6 +37,13 @@ def lu_chipman(m: RealArray) -> LuChipman:
     """Lu-Chipman decomposition of Mueller matrices (..., 4, 4); the factors have the type of m.
 
     Linear retarder, half wave plate and rotation come back as themselves, the ideal depolarizer as not defined.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> parts = lu_chipman(np.diag([1, 0.5, 0.5, 0.5]))
+    >>> np.diag(parts.depolarizer).round(6).tolist(), np.diag(parts.retarder).round(6).tolist()
+    ([1.0, 0.5, 0.5, 0.5], [1.0, 1.0, 1.0, 1.0])
     """
     planar, shape = as_planar(m)
     planar = np.ascontiguousarray(planar)

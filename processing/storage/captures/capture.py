@@ -49,6 +49,12 @@ class Capture(OpenH5):
     header : CaptureHeader
     role : tuple of str, for each state done
     angles_deg : dict of axis name to array (states,), degrees as read back
+
+    Examples
+    --------
+    >>> with Capture("sphere.h5") as capture:
+    ...     capture.header.wavelength_nm, capture.frame_shape, capture.angles_deg["psa"][2:4].tolist()
+    (662.0, (24, 32), [0.0, 44.19])
     """
 
     def __init__(self, path: Path | str, *, verify: bool = True, by_super_pixel: bool = False) -> None:

@@ -59,6 +59,12 @@ class MuellerImage:
         As in the product.
     sent : (4, rows, columns), Stokes vector that the sample sends back, where no element is determined alone.
     dark : (16, K), counts, errors of the elements that one standard error of each mean of dark frames makes.
+
+    Examples
+    --------
+    >>> image = MuellerImage.load(Reduction("sphere.h5").make())
+    >>> image.values.shape, image.errors.shape, image.w.shape
+    ((4, 4, 24, 32), (4, 4, 24, 32), (40, 16))
     """
 
     values: NDArray[np.float32]
@@ -323,6 +329,12 @@ class StokesImage:
     w, analyzers : (channels, 16) and (channels, 3), from the Mueller matrix and from S to intensities.
     mask : (rows, columns) uint8, bits of `processing.storage.products.pixel_mask.Mask`.
     neighbour_correlation : (2 R + 1, 2 R + 1), of the noise of S1 and S2 between pixels, by rows and columns.
+
+    Examples
+    --------
+    >>> image = StokesImage.load(Reduction("mosaic.h5").make())
+    >>> image.values.shape, image.covariance.shape
+    ((3, 24, 32), (24, 32, 3, 3))
     """
 
     values: NDArray[np.float32]

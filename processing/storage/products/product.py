@@ -265,6 +265,12 @@ class Product(OpenH5):
         Provenance, oldest first
     facts : dict of numbers and warnings of the last step
     shape : (rows, columns)
+
+    Examples
+    --------
+    >>> with Product(Reduction("sphere.h5").make()) as product:
+    ...     product.kind, product.shape, product.steps[-1].name, product.units("mueller")
+    ('mueller', (24, 32), 'reduce', 'count')
     """
 
     def __init__(self, path: Path | str) -> None:

@@ -1,0 +1,73 @@
+"""The examples of docstrings, as a reader would type them in a folder with captures of a sphere and of air."""
+
+import doctest
+import importlib
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import pytest
+
+import processing
+from processing.instrument.model import InstrumentModel
+from simulators.bench.bench import SimulatedBench
+from simulators.bench.scene import Scene
+from simulators.bench.virtual_capture import write_virtual_capture
+
+ROOT = Path(__file__).resolve().parents[2]
+ROOMS = ("acquisition", "drivers", "processing", "simulators", "viewer")
+#: Modules that have examples.
+WITH_EXAMPLES = [
+    ".".join(file.relative_to(ROOT).with_suffix("").parts)
+    for room in ROOMS
+    for file in sorted((ROOT / room).rglob("*.py"))
+    if ">>> " in file.read_text()
+]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory, configs):
+    """Folder with sphere.h5, sphere_60.h5, mosaic.h5, air.h5, instrument.yaml, geometry.yaml and material.yaml."""
+    folder = tmp_path_factory.mktemp("examples")
+    shutil.copy(configs / "instruments/rgb950.yaml", folder / "instrument.yaml")
+    shutil.copy(configs / "geometries/one_inch_sphere.yaml", folder / "geometry.yaml")
+    shutil.copy(configs / "materials/red_print.yaml", folder / "material.yaml")
+    declared = InstrumentModel.load(folder / "instrument.yaml")
+    azimuth = declared.value_of("psg_retarder.azimuth_deg")
+    # What the diagnosis is to find: the generator's retarder stands half a degree off.
+    off = declared.with_values({"psg_retarder": {"azimuth_deg": {nm: deg + 0.5 for nm, deg in azimuth.items()}}})
+    mosaic = InstrumentModel.load(configs / "instruments/linear_stokes.yaml")
+    scenes = {scene: Scene.load(configs / f"scenes/{scene}.yaml") for scene in ("red_sphere", "air")}
+    for name, scene, omega, true, said in (
+        ("sphere", "red_sphere", 35, declared, declared),
+        ("sphere_60", "red_sphere", 60, declared, declared),
+        ("air", "air", 180, off, declared),
+        ("mosaic", "red_sphere", 35, mosaic, mosaic),
+    ):
+        bench = SimulatedBench(scenes[scene], true, 662, 24, 32, seed=1, flux_e_per_s=5e5)
+        states = 1 if said.mosaic else 40
+        write_virtual_capture(folder / f"{name}.h5", bench, said, omega, states=states, darks=2, name=scene)
+    with h5py.File(folder / "air.h5", "r+") as h5:
+        header = json.loads(h5["entry"].attrs["header_json"]) | {"sample": {"kind": "air", "name": "air"}}
+        h5["entry"].attrs["header_json"] = json.dumps(header)
+    return folder
+
+
+def test_every_public_name_has_an_example():
+    without = [name for name in processing.__all__ if ">>> " not in (getattr(processing, name).__doc__ or "")]
+    assert without == []
+
+
+@pytest.mark.parametrize("name", WITH_EXAMPLES)
+def test_examples_print_what_they_say(name, made, tmp_path, monkeypatch):
+    module = importlib.import_module(name)
+    public = {public: getattr(processing, public) for public in processing.__all__}
+    found = doctest.DocTestFinder().find(module, extraglobs=public | {"Path": Path})
+    said: list[str] = []
+    runner = doctest.DocTestRunner(verbose=False)
+    for number, example in enumerate(found):
+        monkeypatch.chdir(shutil.copytree(made, tmp_path / str(number)))
+        runner.run(example, out=said.append)
+    assert runner.tries > 0
+    assert not runner.failures, "".join(said)
