@@ -185,6 +185,14 @@ class _Average:
         self._frames = 0
 
     def add(self, frame: Frame) -> None:
+        """Add a frame. Raises FrameLost for one that equals the frame before; frames of one value are not judged."""
+        pixels = frame.pixels
+        if self._frames and np.array_equal(pixels, self._last.pixels) and pixels.min() != pixels.max():
+            raise FrameLost(
+                "camera, frame of an average",
+                "it is the same, pixel by pixel, as the one before: the camera or its driver is frozen",
+                "Switch the camera off and on",
+            )
         if self._frames == 0:
             self._sum = frame.pixels.astype(np.uint32)
             # The largest of each pixel, because the top may be learnt from a later frame.

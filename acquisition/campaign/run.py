@@ -8,6 +8,9 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from acquisition.campaign.identity import require_same_campaign, with_devices
 from acquisition.campaign.log import CampaignFolder, entry_of
 from acquisition.campaign.plan import Campaign, CampaignCapture, captures
@@ -116,6 +119,7 @@ class CampaignRun:
         self.observers = observers
         self.home = home
         self._rig: Rig | None = None
+        self._last_frame: NDArray[np.uint16] | None = None
 
     def run(self, jobs: Sequence[tuple[CampaignCapture, Job]]) -> bool:
         """True if every capture is complete at the end, False if a stop was asked for.
@@ -249,7 +253,7 @@ class CampaignRun:
         if self._rig is None:
             rig = open_rig(self.config, ask=self.operator.confirm)
             rig.__enter__()
-            self._rig = rig
+            self._rig, rig.last_frame = rig, self._last_frame
             # A device may have been changed between two tries.
             on_disc("read the campaign", require_same_campaign, self.folder.folder, with_devices({}, rig))
             rig.start_guard(self.folder.folder / GUARD_LOG)
@@ -257,6 +261,8 @@ class CampaignRun:
 
     def _close_rig(self, *, will_retry: bool = False) -> None:
         rig, self._rig = self._rig, None
+        if rig is not None:
+            self._last_frame = rig.last_frame
         failure = rig.close(will_retry=will_retry) if rig is not None else None
         if failure is not None:
             self.folder.log("closing the rig failed", error=str(failure))

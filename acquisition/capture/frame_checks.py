@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from acquisition.capture.repeated_state import RepeatedState
 from acquisition.errors import RunFailed
@@ -32,16 +33,24 @@ class FrameChecks:
     rows : of the measurement matrix (states, 16) for the mean of a frame; None where that is not known.
     lit_darks : comparison of darks and lights.
     warn : hears everything that does not end the run.
+    before : the frame that the camera gave before the first one; None where it gave none.
 
     Attributes
     ----------
     evidence : findings so far.
     """
 
-    def __init__(self, black: float, rows: Array | None, lit_darks: LitDarks, warn: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        black: float,
+        rows: Array | None,
+        lit_darks: LitDarks,
+        warn: Callable[[str], None],
+        before: NDArray[np.generic] | None = None,
+    ) -> None:
         self._black, self._warn, self._lit_darks = black, warn, lit_darks
         self._repeated = RepeatedState(black)
-        self.evidence = FrameEvidence(black, rows)
+        self.evidence = FrameEvidence(black, rows, before)
         self._began_with: CameraSettings | None = None
 
     def require_as_reported(self, state: int, frame: Frame, settings: CameraSettings, rig: Rig) -> None:
@@ -53,6 +62,7 @@ class FrameChecks:
         """
         asked = f"camera, frame of state {state}"
         again = self.evidence.repeats(frame.pixels)
+        rig.last_frame = frame.pixels
         if again is not None:
             raise FrameLost(asked, again, "Switch the camera off and on")
         applied = rig.require_camera().applied()

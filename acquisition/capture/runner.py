@@ -110,7 +110,7 @@ class CaptureRunner:
         self._saturation_limit = saturation_limit
         lights = sum(role != "dark" for role in table.role)
         lit_darks = lit_darks or LitDarks(detector.black_level_counts, mosaic=mosaic, lights=lights)
-        self.checks = FrameChecks(detector.black_level_counts, rows, lit_darks, self.warn)
+        self.checks = FrameChecks(detector.black_level_counts, rows, lit_darks, self.warn, rig.last_frame)
         self._wall_clock = WallClock()
         self._rested: dict[str, Position] = {}
 

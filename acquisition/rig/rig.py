@@ -13,6 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 from acquisition.cleanup import Step, run_all
 from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError
@@ -55,6 +58,8 @@ class Rig(JointAxes):
     source : LightSource or None where the rig has none
     clock : Clock
         What every wait and deadline is counted by.
+    last_frame : ndarray or None
+        Pixels of the last frame of a capture, which a frozen camera gives again in the next one.
 
     Parameters
     ----------
@@ -71,6 +76,7 @@ class Rig(JointAxes):
     ) -> None:
         super().__init__(config, clock_of(config))
         self.camera: Camera | None = None
+        self.last_frame: NDArray[np.uint16] | None = None
         self.source: WatchedSource | None = None
         self._camera_entry = config.camera
         self._asked: CameraSettings | None = None

@@ -72,12 +72,13 @@ class FrameEvidence:
     black : counts without light, as declared.
     rows : of the measurement matrix (states, 16) for the mean of a frame, in the order of the plan; None where the
         instrument is not known.
+    before : the frame before the first one, of another run; None where there was none.
     """
 
-    def __init__(self, black: float, rows: Array | None) -> None:
+    def __init__(self, black: float, rows: Array | None, before: NDArray[np.generic] | None = None) -> None:
         self._black, self._rows = black, rows
         self._seen: set[int] = set()
-        self._before: NDArray[np.generic] | None = None
+        self._before = None if before is None else np.ascontiguousarray(before[::ROWS_APART])
         # State, number and time of the frame before.
         self._last = (0, 0, 0)
         self._blocks: dict[int, Array] = {}
@@ -91,7 +92,7 @@ class FrameEvidence:
         if uniform:
             return None
         digest = zlib.crc32(rows.tobytes())
-        if digest in self._seen:
+        if digest in self._seen or (before is not None and np.array_equal(before, rows)):
             return "the frame is the same, pixel by pixel, as an earlier one: the camera or its driver is frozen"
         self._seen.add(digest)
         if before is None or before.shape != rows.shape:

@@ -6,7 +6,15 @@ from dataclasses import replace
 import h5py
 import pytest
 
+from acquisition.capture import session
+from acquisition.capture.job import check_with_devices, prepare
+from acquisition.capture.plan import MeasurementPlan
+from acquisition.disc import disc_process
+from acquisition.errors import RunFailed
+from acquisition.rig.config import load_rig
+from acquisition.rig.open_rig import open_rig
 from acquisition.screen.observer import Observer
+from acquisition.stop_request import StopRequest
 from processing.commands.application import main
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.reduction.counts_to_signal import Correction
@@ -224,6 +232,42 @@ def test_a_frozen_camera_gives_no_complete_capture(run_with, intact):
     with Capture(path) as capture:
         assert capture.status == "failed"
         assert len(capture.done) == 20
+
+
+def test_a_camera_that_is_frozen_in_an_average_gives_no_state(run_with):
+    """The frames of one state are compared with each other: their mean differs from all others."""
+    frames = []
+
+    def act(rig, state, retake):
+        camera = rig.require_camera()
+        if state == 20 and not frames:
+            take = camera._do_frame
+
+            def frozen():
+                frames.append(take())
+                return replace(frames[-1], pixels=frames[0].pixels)
+
+            camera._do_frame = frozen
+
+    error, path = run_with(act, {"repeats": 2}, stamp=False)
+    assert "state 20: 4 frames in a row were lost" in str(error)
+    assert "the camera or its driver is frozen" in str(error)
+
+
+def test_a_camera_that_is_frozen_between_captures_of_one_state_is_noticed(configs, quick_rig, tmp_path):
+    """A polarization camera takes one frame for each capture, which is sound by itself."""
+    config = load_rig(quick_rig(stamp=False))
+    plan = MeasurementPlan.load(configs / "plans" / "stokes.yaml")
+    plan = plan.with_changes(darks=0, states={"kind": "fixed", "states": 1})
+    with disc_process(), open_rig(config) as rig:
+        jobs = [prepare(plan.with_changes(omega_deg=omega_deg), config) for omega_deg in (35.0, 36.0)]
+        check_with_devices(jobs[0], rig, tmp_path)
+        assert session.take(jobs[0], rig, tmp_path / "first.h5", StopRequest()).status == "complete"
+        camera, last = rig.require_camera(), rig.last_frame
+        take = camera._do_frame
+        camera._do_frame = lambda: replace(take(), pixels=last)
+        with pytest.raises(RunFailed, match="the camera or its driver is frozen"):
+            session.take(jobs[1], rig, tmp_path / "second.h5", StopRequest())
 
 
 def test_a_gain_that_changes_is_known_to_reduce_and_to_diagnose(run_with, tmp_path):
