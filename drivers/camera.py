@@ -183,17 +183,18 @@ class _Average:
     def __init__(self, top: TopOfCounts) -> None:
         self._top = top
         self._frames = 0
+        self._last: Frame | None = None
 
     def add(self, frame: Frame) -> None:
         """Add a frame. Raises FrameLost for one that equals the frame before; frames of one value are not judged."""
         pixels = frame.pixels
-        if self._frames and np.array_equal(pixels, self._last.pixels) and pixels.min() != pixels.max():
+        if self._last is not None and np.array_equal(pixels, self._last.pixels) and pixels.min() != pixels.max():
             raise FrameLost(
                 "camera, frame of an average",
                 "it is the same, pixel by pixel, as the one before: the camera or its driver is frozen",
                 "Switch the camera off and on",
             )
-        if self._frames == 0:
+        if self._last is None:
             self._sum = frame.pixels.astype(np.uint32)
             # The largest of each pixel, because the top may be learnt from a later frame.
             self._largest = frame.pixels.copy()
@@ -208,6 +209,7 @@ class _Average:
         mean = ((self._sum + self._frames // 2) // self._frames).astype(np.uint16)
         mean[self._largest >= self._top.counts] = self._top.counts
         mean.flags.writeable = False
+        assert self._last is not None
         return Frame(mean, self._last.frame_id, self._last.camera_time_ns, self._host_time_s)
 
 

@@ -26,7 +26,7 @@ from acquisition.rig.guarded import BEAT_S, Guarding, WatchedSource
 from acquisition.rig.joint_axes import JointAxes
 from acquisition.screen.observer import Observer
 from drivers.camera import Camera, CameraSettings
-from drivers.errors import DeviceError
+from drivers.errors import CommandRejected, DeviceError
 from drivers.motion import MotionAxis
 from drivers.registry import open_axis, open_camera, open_source
 from drivers.serial_link import LineRegistry
@@ -86,6 +86,7 @@ class Rig(JointAxes):
         self._lines = LineRegistry(config.wire_log, self.clock)
         self._guarding: Guarding | None = None
         self._stop_failed: str | None = None
+        self._was_stopped = False
         self._own_losses = 0
         self._guard_news: deque[str] = deque(maxlen=100)
 
@@ -240,24 +241,36 @@ class Rig(JointAxes):
         if guarding is None:
             return
         disobeyed = self.source.disobeyed if self.source is not None else None
-        if will_retry:
-            if disobeyed is not None:
-                guarding.say_failed(f"THE LIGHT IS NOT SHUT, it is tried again for {TRY_S:g} s: {disobeyed}")
-                with contextlib.suppress(AcquisitionError):
-                    self.insist_on_dark()
-                assert self.source is not None
-                disobeyed = self.source.disobeyed
-            # The next try opens the axes anew.
-            self._stop_failed = None
-        failed = [text for text in (disobeyed, self._stop_failed) if text is not None]
+        if will_retry and disobeyed is not None:
+            guarding.say_failed(f"THE LIGHT IS NOT SHUT, it is tried again for {TRY_S:g} s: {disobeyed}")
+            with contextlib.suppress(AcquisitionError):
+                self.insist_on_dark()
+            assert self.source is not None
+            disobeyed = self.source.disobeyed
+        # The next try opens the axes anew.
+        restless = None if will_retry else self._stop_failed or self._unconfirmed_stop()
+        failed = [text for text in (disobeyed, restless) if text is not None]
         text = f"acquire could not make the rig safe: {'; '.join(failed)}" if failed else None
         if not guarding.end(text):
             self.insist_on_dark()
         elif text is not None:
+            dangers = (disobeyed and "THE LIGHT MAY BE ON", restless and "AN AXIS MAY MOVE")
             raise AcquisitionError(
-                f"{text}. THE LIGHT MAY BE ON, AN AXIS MAY MOVE. The guard tries again and gives the alarm until "
-                f"somebody acknowledges it: {ACKNOWLEDGE}"
+                f"{text}. {', '.join(filter(None, dangers))}. The guard tries again and gives the alarm until somebody "
+                f"acknowledges it: {ACKNOWLEDGE}"
             )
+
+    def _unconfirmed_stop(self) -> str | None:
+        """The first axis that was sent a stop and gives no valid answer since, in words; None if all answer."""
+        for name, axis in self.axes.items() if self._was_stopped else ():
+            try:
+                axis.is_moving()
+            except CommandRejected:
+                # The line is well: some controllers answer no question while they move.
+                continue
+            except Exception as error:  # noqa: BLE001 - whatever it was, somebody has to look at the axis
+                return f"axis {name} was sent a stop and does not answer whether it rests ({error})"
+        return None
 
     def insist_on_dark(self) -> None:
         """Try for a minute to shut a light that did not obey. Raises AcquisitionError."""
@@ -284,6 +297,7 @@ class Rig(JointAxes):
             # No thread to be had: one after the other, then.
             shut.run()
         failure = super().stop()
+        self._was_stopped = True
         with contextlib.suppress(RuntimeError):
             shut.join()
         self._stop_failed = None if failure is None else str(failure)

@@ -249,7 +249,7 @@ def test_a_camera_that_is_frozen_in_an_average_gives_no_state(run_with):
 
             camera._do_frame = frozen
 
-    error, path = run_with(act, {"repeats": 2}, stamp=False)
+    error, _ = run_with(act, {"repeats": 2}, stamp=False)
     assert "state 20: 4 frames in a row were lost" in str(error)
     assert "the camera or its driver is frozen" in str(error)
 

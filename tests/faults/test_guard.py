@@ -161,6 +161,34 @@ def test_a_light_that_acquire_cannot_shut_is_shut_by_the_guard(spawn, partial_of
     _until(lambda: "alarm acknowledged" in (tmp_path / "out" / "guard.jsonl").read_text())
 
 
+@pytest.mark.parametrize(("port", "fault"), [("rotators", "garbled"), ("arm", "silent")])
+def test_an_axis_whose_stop_is_not_confirmed_is_stopped_by_the_guard(spawn, partial_of, served, tmp_path, port, fault):
+    simulation, rig, told = served
+    config = load_rig(rig)
+    axes = {name: entry.model_copy(update={"reply_s": 1.0}) for name, entry in config.axes.items()}
+    rig.write_text(dump_yaml(config.model_copy(update={"axes": axes})))
+    child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out")
+    partial_of(tmp_path / "out", child, states=5)
+    _until(lambda: _lit(simulation), child)
+    line = simulation.emulators[port]
+    line.faults.add(parse_fault(fault))
+    child.send_signal(signal.SIGINT)
+    child.send_signal(signal.SIGTERM)
+    _, err = child.communicate()
+    assert child.returncode != 0
+    assert not _lit(simulation)
+    assert "does not answer whether it rests" in err
+    assert "AN AXIS MAY MOVE" in err
+    assert "THE LIGHT MAY BE ON" not in err
+    _until(lambda: told.exists() and told.read_text().count("AXES NOT AT REST") >= 2)
+    line.faults.clear()
+    journal = tmp_path / "out" / "guard.jsonl"
+    _until(lambda: "axes at rest" in journal.read_text())
+    (alarm,) = alarms.unacknowledged()
+    alarms.acknowledge(alarm)
+    _until(lambda: "alarm acknowledged" in journal.read_text())
+
+
 def test_a_guard_writes_to_a_port_that_somebody_holds(watched_rig):
     """What dies slowly, or waits in the kernel, holds its ports: the guard has them already."""
     rig, simulation, _ = watched_rig

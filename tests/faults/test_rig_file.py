@@ -50,6 +50,9 @@ MISTAKES = {
     "homing may hit": (
         {"forbidden": [{"why": "post", "ranges_deg": {"arm": [-10, 5]}}]}, ("homing", "homing arm", "post"),
     ),
+    "homing may hit a turn on": (
+        {"forbidden": [{"why": "post", "ranges_deg": {"arm": [710, 725]}}]}, ("homing", "homing arm", "post"),
+    ),
     "homing way not told": (
         {"homing": {}, "forbidden": [{"why": "post", "ranges_deg": {"arm": [300, 310]}}]}, ("homing arm", "post"),
     ),
