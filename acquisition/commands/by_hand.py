@@ -127,10 +127,11 @@ def move(
 
 def stop(rig: RigFile = None) -> None:
     """Stop every axis, and an acquire that measures on this rig, as Ctrl-C twice would."""
-    from acquisition.rig.config import has_own_emulators
+    from acquisition.rig.config import has_own_emulators, load_rig
     from acquisition.rig.stop_axes import stop_axes
 
-    config = _load(rig)
+    # Not noted as the user's own: a home folder on a disc that hangs must not delay the stop.
+    config = load_rig(rig or DEFAULT_RIG)
     if has_own_emulators(config):
         typer.echo("the axes of this rig are emulators inside the command that uses it: press Ctrl-C twice there")
     elif not stop_axes(config, typer.echo):

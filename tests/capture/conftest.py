@@ -76,6 +76,7 @@ class RecordedRig:
     during_exposure: Callable[[int], None] = lambda number: None
     door_open: bool = False
     temperature_c: float | None = 31.5
+    last_frame: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         self.axes = {name: RecordedAxis(self, name) for name in ("psg", "psa")}

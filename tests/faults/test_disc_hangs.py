@@ -118,6 +118,15 @@ def test_a_capture_goes_on_in_a_new_run_when_the_disc_process_was_killed(begun, 
     assert not simulation.light()
 
 
+def test_stop_writes_nothing(acquire, small_rig, tmp_path, monkeypatch):
+    """The home folder may be on the disc that hangs."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "home"))
+    code, out, _ = acquire("stop", "--rig", small_rig("rig.yaml"))
+    assert code == 0
+    assert "Ctrl-C" in out
+    assert not (tmp_path / "home").exists()
+
+
 def test_a_command_that_a_page_starts_has_its_output_written_by_another(tmp_path):
     jobs, seen = Jobs(tmp_path), set()
     job = jobs.start("move", ["acquire", "move", "psg", "90"], {}, tmp_path)
