@@ -27,6 +27,7 @@ from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.base import load_reflectance
 from processing.storage.captures.capture import Capture
+from processing.whole_file import write_whole_text
 from processing.yaml_file import dump_yaml
 from viewer.library import OWN, Library, NotHere
 
@@ -199,7 +200,8 @@ class Diagnoses:
     def _decide(self, name: str, decision: dict[str, Any]) -> None:
         when = {"time": datetime.now().astimezone().isoformat(timespec="seconds")}
         path = self.folder(name) / "decision.json"
-        path.write_text(json.dumps(decision | when), encoding="utf-8")
+        # The folder may be a colleague's: a link in its place is replaced, not written through.
+        write_whole_text(path, json.dumps(decision | when), follow=False)
 
 
 @lru_cache(maxsize=2)

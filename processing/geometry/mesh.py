@@ -124,8 +124,8 @@ def _load(
         raise GeometryError(f"{path} cannot be read as a mesh ({one_line(error)}). STL, OBJ and PLY are.") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise GeometryError(f"{path} holds no triangles. Export it as a triangle mesh.")
-    if not np.isfinite(mesh.vertices).all():
-        raise GeometryError(f"{path} has corners that are no finite numbers.")
+    if mesh.vertices.shape[1:] != (3,) or not np.isfinite(mesh.vertices).all():
+        raise GeometryError(f"{path} has corners that are not three finite numbers.")
     if not mesh.is_watertight and not allow_holes:
         raise GeometryError(
             f"{path} has holes ({len(mesh.faces)} triangles, not closed): rays would reach its inside. "

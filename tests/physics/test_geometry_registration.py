@@ -128,6 +128,9 @@ def test_bad_meshes_and_silhouettes_are_refused(bumpy, tmp_path):
     (tmp_path / "text.ply").write_text("no mesh")
     with pytest.raises(GeometryError, match="cannot be read"):
         Mesh(file=str(tmp_path / "text.ply")).intersect(CAMERA.position_mm, rays, 0.0)
+    (tmp_path / "flat.obj").write_text("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n")
+    with pytest.raises(GeometryError, match="three finite numbers"):
+        Mesh(file=str(tmp_path / "flat.obj")).intersect(CAMERA.position_mm, rays, 0.0)
     ball = trimesh.creation.icosphere(subdivisions=2, radius=10)
     ball.update_faces(np.arange(len(ball.faces)) > 5)
     ball.export(tmp_path / "open.stl")

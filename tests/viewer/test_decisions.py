@@ -82,6 +82,14 @@ def test_what_one_tab_has_decided_no_other_changes(lab, client, diagnosed, later
     assert "as <code>new.yaml" in client.get("/diagnosis", params={"name": diagnosed}).text
 
 
+def test_a_link_in_the_place_of_a_decision_is_not_followed(lab, diagnosed, tmp_path):
+    link = Diagnoses(Library(lab)).folder(diagnosed) / "decision.json"
+    link.symlink_to(tmp_path / "elsewhere")
+    Diagnoses(Library(lab)).reject(diagnosed, "no")
+    assert not (tmp_path / "elsewhere").exists()
+    assert json.loads(link.read_text())["note"] == "no"
+
+
 def test_a_rejected_model_leaves_its_note_and_no_file(lab, client, diagnosed):
     before = set(lab.iterdir())
     answer = client.post("/decide", json={"name": diagnosed, "note": "the lamp was cold"}, headers=ORIGIN)
