@@ -46,12 +46,18 @@ def _column(name):
     return add
 
 
+def _roles_dark(rows):
+    for k, row in enumerate(rows):
+        row.insert(1, "dark" if k else "role")
+
+
 STATES = {
     "axis called detector": (_column("detector"), "detector"),
     "axis called beam": (_column("beam_deg"), "beam"),
     "axis without a name": (_column(""), "empty name"),
     "axis with a path": (_column("../x"), "letters"),
     "axis twice": (_column("psg"), "given twice"),
+    "every role dark": (_roles_dark, "every state is dark"),
     "a row missing": (lambda rows: rows.pop(5), "state 4 is missing"),
     "one file twice": (_cell(7, 3, "f2.png"), "f2.png is given already in line 4"),
     "state of 400 digits": (_cell(3, 0, "9" * 400), "whole number"),
