@@ -23,7 +23,7 @@ from acquisition.errors import AcquisitionError
 from processing.doors import read_json, read_text
 from processing.errors import ProcessError
 from processing.storage.captures.capture import Capture
-from processing.whole_file import open_plain
+from processing.whole_file import make_plain, open_plain
 from processing.yaml_file import ConfigError, dump_yaml, load_yaml
 
 log = logging.getLogger(__name__)
@@ -107,11 +107,16 @@ _held: dict[Path, filelock.BaseFileLock] = {}
 
 
 def _lock(folder: Path) -> None:
-    lock = filelock.FileLock(folder / ".lock")
+    path = folder / ".lock"
+    lock = filelock.FileLock(path)
     try:
+        # Some versions of the library empty what they lock.
+        make_plain(path)
         lock.acquire(timeout=KILLED_S)
     except filelock.Timeout:
         raise AcquisitionError(f"another program runs the campaign in {folder}. End that one first.") from None
+    except OSError as error:
+        raise AcquisitionError(f"{path} cannot be written ({error.strerror}). Remove it, or make room.") from error
     _held[folder] = lock
 
 

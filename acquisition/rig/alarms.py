@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import errno
 import json
 import os
 import tempfile
@@ -32,10 +33,24 @@ def folder() -> Path:
     return Path(tempfile.gettempdir()) / f"umov-{os.getuid()}"
 
 
+def _made() -> Path:
+    """The folder, made if it is not there. Raises OSError where another user has made it first."""
+    path = folder()
+    path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if not _is_own(path):
+        raise PermissionError(errno.EPERM, "it belongs to another user", str(path))
+    return path
+
+
+def _is_own(path: Path) -> bool:
+    with contextlib.suppress(OSError):
+        return path.lstat().st_uid == os.getuid()
+    return False
+
+
 def give_alarm(rig: str, text: str) -> Path:
     """Write an alarm down, or replace the one of this process; it is over when the file is gone. Raises OSError."""
-    path = folder() / f"alarm-{os.getpid()}.json"
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    path = _made() / f"alarm-{os.getpid()}.json"
     now = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
     new = path.with_suffix(".new")
     new.write_text(json.dumps({"rig": rig, "time": now, "text": text}), encoding="utf-8")
@@ -45,9 +60,8 @@ def give_alarm(rig: str, text: str) -> Path:
 
 def keep(what: str, name: str, text: str) -> str:
     """Write a text to a file in memory; returns a sentence that says where."""
-    path = folder() / name
     try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        path = _made() / name
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         return f"The {what} could not be kept ({error})."
@@ -57,7 +71,7 @@ def keep(what: str, name: str, text: str) -> str:
 def unacknowledged() -> list[Alarm]:
     """The alarms that nobody has acknowledged, the oldest first."""
     found = []
-    for path in folder().glob("alarm-*.json"):
+    for path in folder().glob("alarm-*.json") if _is_own(folder()) else ():
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             content = json.loads(path.read_text(encoding="utf-8"))
             found.append(Alarm(path, str(content["rig"]), str(content["time"]), str(content["text"])))

@@ -223,6 +223,17 @@ def test_a_link_in_the_place_of_the_journal_is_not_followed(served, tmp_path, li
         open_rig(load_rig(served[1])).start_guard(tmp_path / "guard.jsonl")
 
 
+def test_a_folder_of_alarms_of_another_user_is_not_used(monkeypatch, tmp_path):
+    """Where /run has no folder of the user it is in /tmp, and anybody may have made it."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    alarms.give_alarm("bench", "theirs")
+    monkeypatch.setattr(os, "getuid", lambda: 4711)
+    assert alarms.unacknowledged() == []
+    assert "belongs to another user" in alarms.keep("record", "end.json", "{}")
+    with pytest.raises(PermissionError):
+        alarms.give_alarm("bench", "ours")
+
+
 def test_acknowledge_is_a_command(acquire, monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     path = alarms.give_alarm("bench", "THE LIGHT IS NOT SHUT")

@@ -116,6 +116,10 @@ def test_what_others_put_in_the_place_of_our_files_is_not_written(put, configs, 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "victim").write_text("precious")
     campaign = Campaign.load(configs / "campaigns" / "red_sphere.yaml")
+    (tmp_path / "other").mkdir()
+    put(tmp_path / "other" / ".lock")
+    with pytest.raises(AcquisitionError, match=r"\.lock cannot be written"):
+        CampaignFolder(tmp_path / "other", campaign)
     folder = CampaignFolder(tmp_path / "night", campaign)
     put(tmp_path / "night" / "log.jsonl")
     with pytest.raises(AcquisitionError, match=r"log\.jsonl cannot be written"):
