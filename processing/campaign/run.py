@@ -22,7 +22,6 @@ from processing.campaign.tasks import CaptureMeasure, CaptureTask, locate, measu
 from processing.computing.blas import one_blas_thread
 from processing.errors import NotDetermined
 from processing.geometry.viewing import ViewingGeometry
-from processing.polarization.image_difference import rmsd
 from processing.reduction.mueller import Progress
 from processing.reflectance.tables import ScatteringTable
 from processing.storage.products.provenance import Step, file_identity
@@ -48,8 +47,9 @@ class Row:
     """Deviations at one wavelength and arm angle; NaN where a capture is missing.
 
     `psi_noise_deg`, `magnitude_noise_percent` and `xi0_noise_percent` are what the noise alone, first order, makes of
-    the deviation (xi0: of both instruments), `common` the fraction of the virtual sphere where both have a value,
-    `eigenvalue_deviation` the 99th percentile of the largest deviation of xi1..xi3 from their mean, without what
+    the deviation (xi0: of both instruments), `xi0_systematic_percent` what the stated uncertainties of both
+    instruments make of it (0 where none is stated), `common` the fraction of the virtual sphere where both have a
+    value, `eigenvalue_deviation` the 99th percentile of the largest deviation of xi1..xi3 from their mean, without what
     noise alone makes of it, which is `eigenvalue_noise`.
     """
 
@@ -61,6 +61,7 @@ class Row:
     psi_noise_deg: float = np.nan
     magnitude_noise_percent: float = np.nan
     xi0_noise_percent: float = np.nan
+    xi0_systematic_percent: float = np.nan
     common: float = np.nan
     eigenvalue_deviation: float = np.nan
     eigenvalue_noise: float = np.nan
@@ -217,27 +218,28 @@ def compare_on_sphere(
     omega_deg: float,
     shape: tuple[int, int],
 ) -> dict[str, float]:
-    """Deviation of two xi0 tables on a virtual object (Jarecki and Kupinski, Sec. V-B): `xi0_percent`, its noise
-    part, `common`.
+    """Deviation of two xi0 tables on a virtual object (Jarecki and Kupinski, Sec. V-B): `xi0_percent`, what noise and
+    the instruments' uncertainties make of it, `common`.
 
-    Both tables hold (xi0, variance of xi0). Raises NotDetermined when the object is not in the frame.
+    Tables with the same uncertain inputs are of one instrument, whose error their difference shares. Raises
+    NotDetermined when the object is not in the frame.
     """
     image = view.at(omega_deg, *shape)
     if not image.mask.any():
         raise NotDetermined(f"no pixel of the virtual object is lit at omega {omega_deg:g} degrees")
-    a, b = reference.lookup(image.points.angles), other.lookup(image.points.angles)
-    difference = b[0] - a[0]
-    both = np.isfinite(difference)
+    tables, angles = (reference, other), image.points.angles
+    a, b = (table.lookup(angles)[0] for table in tables)
+    both = np.isfinite(b - a)
     if not both.any():
         return {"common": 0.0}
-    # A bin's mean of n pixels has a variance n times smaller than its pixels.
-    noise = a[1] / _counts(reference, image.points.angles) + b[1] / _counts(other, image.points.angles)
-    return {
-        "xi0_percent": 100 * rmsd(difference),
-        "xi0_noise_percent": 100 * float(np.sqrt(np.mean(noise[both]))),
-        "common": float(both.mean()),
-    }
+    noise = [table.lookup(angles, of=table.uncertainties["u_noise"])[0, both] for table in tables]
+    moved = [table.lookup(angles, of=table.directions)[:, 0, both] for table in tables]
+    shared = reference.inputs == other.inputs
+    parts = {"": [(b - a)[both]], "noise_": noise, "systematic_": [moved[1] - moved[0]] if shared else moved}
+    found = {f"xi0_{name}percent": 100 * _size(part) for name, part in parts.items()}
+    return found | {"common": float(both.mean())}
 
 
-def _counts(table: ScatteringTable, angles: Any) -> NDArray[np.float64]:
-    return np.asarray(np.maximum(table.counts(angles), 1), dtype=float)
+def _size(parts: Sequence[NDArray[np.float64]]) -> float:
+    """Root mean square over the pixels, the last axis, of the quadratic sum of all parts."""
+    return float(np.sqrt(sum(np.sum(np.square(part)) / part.shape[-1] for part in parts)))

@@ -16,12 +16,13 @@ from processing.geometry.outline import find_sphere, registered
 from processing.geometry.viewing import ViewingGeometry
 from processing.maps.coherency_noise import coherency_noise, largest_deviation_by_noise
 from processing.maps.tables import xi0_samples
-from processing.maps.xi0 import estimate_from_stokes
+from processing.maps.xi0 import estimate_from_stokes, moved_xi0, refitted
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
 from processing.polarization.eigenvalue_noise import corrected
 from processing.polarization.gradients import dominant
 from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
 from processing.polarization.quantities import deviation_from_td
+from processing.reduction.systematic import Systematic
 from processing.reflectance.base import load_reflectance
 from processing.reflectance.tables import ScatteringTable
 from processing.steps.maps import geometry_identities
@@ -119,7 +120,7 @@ def reduced_product(task: CaptureTask) -> Path:
 def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) -> CaptureMeasure:
     with Product(product) as opened:
         require_all_elements(opened)
-        whole = MuellerImage.of(opened)
+        whole, systematic = MuellerImage.of(opened), Systematic.of_product(opened)
     geometry = view.at(float(whole.header.omega_deg or 0.0), *whole.mask.shape)
     # The object alone, as rows of one pixel: what lies beside it costs as much.
     image = whole.at(np.flatnonzero(geometry.mask))
@@ -137,13 +138,14 @@ def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) ->
     psi_noise, magnitude_noise = _noise_of_dominant(image, chosen)
     deviation = np.abs(deviation_from_td(eigenvalues)).max(axis=-1)[good]
     most = _most(deviation)
+    moves = None if systematic is None else moved_xi0(systematic, image)[..., 0]
     by_noise = _most(largest_deviation_by_noise(image.at(chosen))) if chosen.size else float("nan")
     return CaptureMeasure(
         kind="mueller",
         wavelength_nm=image.header.wavelength_nm,
         omega_deg=float(image.header.omega_deg or 0.0),
         shape=(whole.mask.shape[0], whole.mask.shape[1]),
-        table=_table(task, product, geometry, (xi0, stderr, good), image.header.wavelength_nm, image.simulated),
+        table=_table(task, product, geometry, (xi0, stderr, good), systematic, moves),
         psi_deg=float(np.rad2deg(rmsd(psi))),
         magnitude_percent=100 * rmsd((magnitude(modelled) - magnitude(measured))[good]),
         eigenvalue_deviation=float(np.sqrt(max(most**2 - by_noise**2, 0.0))),
@@ -176,11 +178,17 @@ def _noise_of_dominant(image: MuellerImage, pixels: NDArray[np.int64]) -> tuple[
 
 def _measure_stokes(task: CaptureTask, product: Path, view: ViewingGeometry) -> CaptureMeasure:
     image = StokesImage.load(product)
+    with Product(product) as opened:
+        systematic = Systematic.of_product(opened)
     header = image.header
     geometry = view.at(float(header.omega_deg or 0.0), *image.mask.shape)
     model = load_reflectance(task.material).mueller_jones(geometry.points, header.wavelength_nm)
-    found = estimate_from_stokes(image, np.asarray(geometry.fill(model), dtype=float))
-    inside = geometry.mask
+    m0 = np.asarray(geometry.fill(model), dtype=float)
+    found = estimate_from_stokes(image, m0)
+    inside, moves = geometry.mask, None
+    if systematic is not None:
+        fitted = np.tensordot(image.analyzers, image.values.astype(float), axes=1)
+        moves = refitted(systematic, fitted, found.xi0, m0)[:, inside]
     xi0, stderr = found.xi0[inside], found.xi0_stderr[inside]
     good = found.valid[inside] & _inner(geometry, task.border_px)
     return CaptureMeasure(
@@ -188,7 +196,7 @@ def _measure_stokes(task: CaptureTask, product: Path, view: ViewingGeometry) -> 
         wavelength_nm=header.wavelength_nm,
         omega_deg=float(header.omega_deg or 0.0),
         shape=(image.mask.shape[0], image.mask.shape[1]),
-        table=_table(task, product, geometry, (xi0, stderr, good), header.wavelength_nm, image.simulated),
+        table=_table(task, product, geometry, (xi0, stderr, good), systematic, moves),
         psi_deg=float("nan"),
         magnitude_percent=float("nan"),
         eigenvalue_deviation=float("nan"),
@@ -209,20 +217,22 @@ def _table(
     product: Path,
     geometry: GeometryImage,
     samples: tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.bool_]],
-    wavelength_nm: float,
-    simulated: bool,
+    systematic: Systematic | None,
+    moves: NDArray[np.floating] | None,
 ) -> str:
-    # samples: xi0, its standard error, and which pixels count, all (N,).
+    # samples: xi0, its standard error, and which pixels count, all (N,); moves (D, N) by each direction.
     xi0, stderr, good = samples
-    table = ScatteringTable(("xi0", "xi0_variance"), wavelength_nm, simulated=simulated)
+    inputs = () if systematic is None else systematic.labels
     with Product(product) as opened:
-        correlation = neighbour_correlation(opened)
+        correlation, nm, simulated = neighbour_correlation(opened), opened.header.wavelength_nm, opened.simulated
+    table = ScatteringTable(("xi0",), nm, simulated=simulated, has_noise=True, inputs=inputs)
     values = xi0_samples(table, geometry, xi0, np.where(good, stderr, np.nan), correlation)
+    values = values if moves is None else np.concatenate([values, moves])
     values[:, ~good] = np.nan
-    table.add(geometry.points.angles, values, simulated)
+    table.add(geometry.points.angles, values)
     material = file_identity(Path(task.material), "material")
-    inputs = (file_identity(product, "source"), *geometry_identities(Path(task.geometry)), material)
+    sources = (file_identity(product, "source"), *geometry_identities(Path(task.geometry)), material)
     # Named after the product, whose name is its own even where two folders hold captures of one name.
     path = product.with_name(f"{product.stem}.xi0.table.h5")
-    table.save(path, (Step("campaign-xi0", {"border_px": task.border_px, "view": task.view_json}, inputs),))
+    table.save(path, (Step("campaign-xi0", {"border_px": task.border_px, "view": task.view_json}, sources),))
     return str(path)

@@ -202,6 +202,7 @@ COLUMNS = (
     ("magnitude_noise_percent", "its noise"),
     ("xi0_percent", "xi0/%"),
     ("xi0_noise_percent", "its noise"),
+    ("xi0_systematic_percent", "its instr."),
     ("common", "common"),
     ("eigenvalue_deviation", "eigenvalues"),
     ("eigenvalue_noise", "their noise"),

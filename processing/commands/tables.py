@@ -28,6 +28,8 @@ def table_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a table of that name.")] = False,
 ) -> None:
     """Mean, variance and count over theta_h, theta_d, phi_d from any number of images."""
+    import numpy as np
+
     from processing.commands.progress_bar import progress_bar
     from processing.errors import ProcessError
     from processing.reflectance.tables import ScatteringTable
@@ -42,6 +44,8 @@ def table_command(
     if table.simulated:
         typer.echo("SIMULATED data")
     typer.echo(f"  {', '.join(table.quantities[:4])}{' ...' if len(table.quantities) > 4 else ''}")
+    for part, values in table.uncertainties.items():
+        typer.echo(f"  {part}, median over bins and quantities: {np.nanmedian(values):.3g}")
     typer.echo(f"  bins filled: {table.bins.size} of {91 * 91 * 360}, samples: {int(table.count.sum())}")
     typer.echo(str(out))
 
@@ -63,7 +67,7 @@ def compare_command(
 
     tables = [ScatteringTable.load(p) for p in (reference, other)]
     for path, table in zip((reference, other), tables, strict=True):
-        if table.quantities[:2] != ("xi0", "xi0_variance"):
+        if table.quantities != ("xi0",) or not table.has_noise:
             raise ProcessError(f"{path} holds {', '.join(table.quantities[:3])}; give tables of xi0 products.")
     a, b = tables
     if abs(a.wavelength_nm - b.wavelength_nm) > 0.5:
@@ -77,15 +81,18 @@ def compare_command(
     view = ViewingGeometry.load(geometry)
     if a.simulated:
         typer.echo("SIMULATED data")
-    typer.echo(f"{a.wavelength_nm:g} nm, RMSD of xi0 on the virtual object, and what noise alone makes of it")
-    typer.echo("  Omega     xi0/%  its noise    common")
+    typer.echo(f"{a.wavelength_nm:g} nm, RMSD of xi0 on the virtual object, and what uncertainties make of it")
+    for path, table in zip((reference, other), tables, strict=True):
+        if not table.inputs:
+            typer.echo(f"warning: no uncertainty of its instrument is known to {path}; u instr. has none", err=True)
+    typer.echo("  Omega     xi0/%    u noise  u instr.    common")
     for angle in angles:
         found = compare_on_sphere(a, b, view, angle, (size, size))
         if not found["common"]:
             typer.echo(f"  {angle:5g}  no direction in which both tables have a value")
             continue
-        xi0, noise = found["xi0_percent"], found["xi0_noise_percent"]
-        typer.echo(f"  {angle:5g} {xi0:9.3f} {noise:10.3f} {found['common']:9.3f}")
+        shown = (f"{found[f'xi0_{part}percent']:9.3f}" for part in ("", "noise_", "systematic_"))
+        typer.echo(f"  {angle:5g} {'  '.join(shown)} {found['common']:9.3f}")
     with whole_file(figure) as new:
         tables_figure(a, b, view, angles[0], (size, size)).savefig(new, dpi=150)
     typer.echo(str(figure))
@@ -96,6 +103,7 @@ def export_command(
     out: Annotated[Path, typer.Option(help="Renderer file (.pbsdf) to write; about 1 GB.")],
     white_m00: Annotated[float, typer.Option(help="M00 of a perfect white surface at normal incidence.")] = 1.0,
     keep_gaps: Annotated[bool, typer.Option("--keep-gaps", help="Leave empty bins black.")] = False,
+    uncertainty: Annotated[bool, typer.Option("--uncertainty", help="Add u of each element; another 1 GB.")] = False,
 ) -> None:
     """Write tables as a Mitsuba .pbsdf."""
     from processing.commands.progress_bar import progress_bar
@@ -104,7 +112,9 @@ def export_command(
 
     with progress_bar("writing", "wavelengths") as tick:
         gaps: Literal["nearest", "nan"] = "nan" if keep_gaps else "nearest"
-        missing = export([ScatteringTable.load(p) for p in tables], out, white_m00, gaps, progress=tick)
+        missing = export(
+            [ScatteringTable.load(p) for p in tables], out, white_m00, gaps, progress=tick, uncertainty=uncertainty
+        )
     filled = "left black" if keep_gaps else "filled with the nearest bin"
     typer.echo(f"  visible bins without a sample: {100 * missing:.1f} %, {filled}")
     typer.echo(str(out))

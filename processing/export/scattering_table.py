@@ -16,8 +16,8 @@ from processing.reflectance.tables import AXES, ScatteringTable
 def table_to_csv(source: Path, out: Path, quantities: Sequence[str] = (), overwrite: bool = False) -> list[Path]:
     """Write a table of `process table` as CSV; returns the file.
 
-    The centre of each bin in degrees, the number of its samples, then of each quantity the mean and the variance of
-    the samples; the variance of a single one is nan.
+    The centre of each bin in degrees, the number of its samples, then of each quantity the mean, its standard
+    uncertainties as far as they are known, and the variance of the samples; that of a single one is nan.
 
     Parameters
     ----------
@@ -39,15 +39,18 @@ def table_to_csv(source: Path, out: Path, quantities: Sequence[str] = (), overwr
     centres = table.axes.angles(table.bins[order])
     columns = {name: np.rad2deg(angle).round(9) for name, angle in zip(AXES, centres, strict=True)}
     columns["samples"] = table.count[order]
-    mean, variance = table.mean[:, order], table.variance[:, order]
+    mean, variance, uncertainties = table.mean[:, order], table.variance[:, order], table.uncertainties
     for k, name in enumerate(table.quantities):
         if not quantities or name in quantities:
-            columns[name], columns[f"{name}_sample_variance"] = mean[k], variance[k]
+            columns[name] = mean[k]
+            columns |= {f"{name}_{part}": values[k, order] for part, values in uncertainties.items()}
+            columns[f"{name}_sample_variance"] = variance[k]
     facts = {
         "wavelength_nm": table.wavelength_nm,
         "simulated": table.simulated,
         "layout": table.axes.layout,
         "frames": table.frames or "none: scalars",
+        "uncertain_in_the_instrument": "; ".join(table.inputs) or "nothing stated",
     }
     write_csv(path, facts, dict.fromkeys(AXES, "degree"), columns)
     return [path]

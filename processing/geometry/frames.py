@@ -135,10 +135,16 @@ def transverse_axes(k: Array, up: Array = WORLD_UP) -> tuple[Array, Array]:
 
 def change_frames(m: ArrayLike, geometry: ScatteringGeometry, up: ArrayLike) -> Array:
     """Mueller matrices (..., 4, 4) given in the geometry's axes, referred to the axes that `up` fixes."""
+    turn_out, turn_in = frame_turns(geometry, up)
+    return np.asarray(turn_out @ np.asarray(m, dtype=np.float64) @ turn_in)
+
+
+def frame_turns(geometry: ScatteringGeometry, up: ArrayLike) -> tuple[Array, Array]:
+    """Matrices (..., 4, 4) between which a Mueller matrix stands to be referred to the axes that `up` fixes."""
     target = geometry.with_up(up)
     turn_in = _turn(-geometry.to_source, geometry.axes_in[0], target.axes_in[0])
     turn_out = _turn(geometry.to_camera, geometry.axes_out[0], target.axes_out[0])
-    return np.asarray(mueller.rotation(-turn_out) @ np.asarray(m, dtype=np.float64) @ mueller.rotation(turn_in))
+    return mueller.rotation(-turn_out), mueller.rotation(turn_in)
 
 
 def _turn(k: Array, x_from: Array, x_to: Array) -> Array:

@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations_with_replacement
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.errors import ProcessError
-from processing.geometry.frames import GeometryImage
+from processing.geometry.frames import GeometryImage, frame_turns
 from processing.geometry.viewing import ViewingGeometry
+from processing.maps.intervals import moves_of
 from processing.reduction.mueller import Progress
-from processing.reduction.systematic import INPUTS
-from processing.reflectance.pbsdf import MUELLER, to_renderer_frames
+from processing.reduction.systematic import INPUTS, Systematic
+from processing.reflectance.pbsdf import MUELLER
 from processing.reflectance.shared_noise import shared_variance
 from processing.reflectance.table_axes import Layout
 from processing.reflectance.tables import ScatteringTable
+from processing.storage.products.images import MuellerImage, require_all_elements
 from processing.storage.products.images import neighbour_correlation as noise_between
-from processing.storage.products.images import require_all_elements
 from processing.storage.products.product import Product
+
+#: Elements of a Mueller matrix that turning both axes mixes.
+_MIXED = ((0,), (3,), (12,), (15,), (1, 2), (4, 8), (7, 11), (13, 14), (5, 6, 9, 10))
 
 
 def xi0_samples(
@@ -44,27 +50,71 @@ def xi0_samples(
 
 
 def _xi0_values(table: ScatteringTable, image: GeometryImage, product: Product) -> NDArray[np.float64]:
-    """Values (quantities, N) of a table from a whole xi0 product; NaN where that is not valid."""
+    """Values (planes, N) of a table from a whole xi0 product; NaN where that is not valid."""
     valid = product.get("valid")[image.mask] > 0
     xi0, error = (product.get(name)[image.mask] for name in ("xi0", "xi0_errors"))
     values = xi0_samples(table, image, xi0, np.where(valid, error, np.nan), noise_between(product))
-    if len(table.quantities) > len(values):
-        if table.quantities[2:] != _directions(product):
-            raise ProcessError(
-                f"{product.path} was reduced with an instrument of other uncertain values than those in the table. "
-                "Reduce all captures with one file: process reduce --instrument FILE"
-            )
+    if table.inputs:
         values = np.concatenate([values, product.get("xi0_directions")[:, image.mask]])
     values[:, ~valid] = np.nan
     return values
 
 
-def _directions(product: Product) -> tuple[str, ...]:
-    """Quantities of a table: what one standard uncertainty of each uncertain input of the instrument does to xi0."""
-    if product.kind != "xi0" or INPUTS not in product.facts:
-        return ()
-    labels = str(product.facts[INPUTS]).replace(", ", "+").split("; ")
-    return tuple(f"xi0_direction_{k}_{label}" for k, label in enumerate(labels))
+def _mueller_values(table: ScatteringTable, image: GeometryImage, product: Product, rows: slice) -> Array:
+    """Values (planes, N) of a table from some rows of a Mueller product, turned into the renderer's axes."""
+    block = MuellerImage.of(product, rows).at(np.flatnonzero(image.mask))
+    left, right = frame_turns(image.points, image.points.half)
+    parts = [(left @ block.matrices[:, 0].astype(float) @ right)[None]]
+    if table.has_noise:
+        parts.append(_turned_variance(block, left, right)[None])
+    if table.inputs and (systematic := Systematic.of_product(product)) is not None:
+        moves = moves_of(systematic, block).reshape(-1, 4, 4, len(left))
+        parts.append(left @ np.moveaxis(moves, -1, 1) @ right)
+    return np.moveaxis(np.concatenate(parts), 1, -1).reshape(table.planes, -1)
+
+
+def _turned_variance(image: MuellerImage, left: Array, right: Array) -> Array:
+    """Variance (N, 4, 4) of the elements of left @ M @ right, where the outer two (N, 4, 4) are rotations."""
+    found = np.zeros((len(left), 16))
+    for group in _MIXED:
+        share = {(k, i): left[:, k // 4, i // 4] * right[:, i % 4, k % 4] for k in group for i in group}
+        for i, j in combinations_with_replacement(group, 2):
+            between = (1 + (i != j)) * image.covariance_between(i, j)[:, 0]
+            for k in group:
+                found[:, k] += share[k, i] * share[k, j] * between
+    return found.reshape(-1, 4, 4)
+
+
+def _table_for(product: Product, layout: Layout) -> ScatteringTable:
+    """An empty table for the samples of a product."""
+    product.require("mueller", "xi0")
+    if product.header.omega_deg is None:
+        raise ProcessError(f"{product.path}: the capture does not say its arm angle; it belongs to no bin.")
+    names: tuple[str, ...] = ("xi0",)
+    frames, has_noise = "", True
+    if product.kind == "mueller":
+        require_all_elements(product)
+        names, frames, has_noise = MUELLER, "renderer", bool(np.isfinite(product.get("mueller_errors")).any())
+    inputs = tuple(str(product.facts[INPUTS]).split("; ")) if INPUTS in product.facts else ()
+    return ScatteringTable(
+        names, product.header.wavelength_nm, layout, product.simulated, frames, has_noise=has_noise, inputs=inputs
+    )
+
+
+def _require_alike(source: Path, own: ScatteringTable, table: ScatteringTable) -> None:
+    if abs(table.wavelength_nm - own.wavelength_nm) > 0.5:
+        raise ProcessError(
+            f"{source} is at {own.wavelength_nm:g} nm, the table at {table.wavelength_nm:g} nm; "
+            "make one table for each wavelength."
+        )
+    if table.quantities != own.quantities:
+        raise ProcessError(f"{source} has {own.quantities[0]}, the table has {table.quantities[0]}. Make one of each.")
+    if (table.has_noise, table.inputs) != (own.has_noise, own.inputs):
+        raise ProcessError(
+            f"{source} was reduced with other uncertainties than the images in the table: of the instrument "
+            f"{', '.join(own.inputs) or 'none'} instead of {', '.join(table.inputs) or 'none'}. Reduce all captures "
+            "with one file: process reduce --instrument FILE"
+        )
 
 
 def tabulate(
@@ -77,45 +127,33 @@ def tabulate(
     """Add the images of products to a table; a new one is made if none is given.
 
     Mueller matrices are turned into the renderer's axes pixel by pixel, so that pixels of one bin are alike.
-    xi0 products add their valid pixels, with the variance of each and its covariances with the other pixels of the bin,
-    so that tables can be compared with their noise. Those of Mueller images are not averaged over neighbours. The
-    mean of each direction of the instrument's uncertainty is in the table: the root of their sum of squares is the
-    systematic uncertainty of a bin's mean xi0.
+    xi0 products add their valid pixels; the variance of each has its covariances with the other pixels of the bin.
+    Those of Mueller images are not averaged over neighbours. The mean of each direction of the instrument's
+    uncertainty is in the table: the root of their sum of squares is the systematic uncertainty of a bin's mean.
 
     Raises
     ------
-    ProcessError : products of another kind or wavelength, without an arm angle, or simulated and measured mixed.
+    ProcessError
+        Products of another kind, wavelength or instrument, without an arm angle, or simulated and measured mixed.
     """
     view = ViewingGeometry.load(geometry_file)
     for done, source in enumerate(sources, 1):
         with Product(source) as product:
-            product.require("mueller", "xi0")
-            if product.kind == "mueller":
-                require_all_elements(product)
-            header, simulated, kind = product.header, product.simulated, product.kind
-            if header.omega_deg is None:
-                raise ProcessError(f"{source}: the capture does not say its arm angle; it belongs to no bin.")
-            if table is None:
-                of_xi0 = ("xi0", "xi0_variance", *_directions(product))
-                names, frames = (MUELLER, "renderer") if kind == "mueller" else (of_xi0, "")
-                table = ScatteringTable(names, header.wavelength_nm, layout, simulated, frames)
-            if abs(table.wavelength_nm - header.wavelength_nm) > 0.5:
-                raise ProcessError(
-                    f"{source} is at {header.wavelength_nm:g} nm, the table at {table.wavelength_nm:g} nm; "
-                    "make one table for each wavelength."
-                )
+            own = _table_for(product, layout)
+            table = own if table is None else table
+            _require_alike(source, own, table)
+            kind, omega_deg = product.kind, float(product.header.omega_deg or 0.0)
             # Neighbours share noise across the borders of blocks.
             blocks = product.row_blocks() if kind == "mueller" else [slice(0, product.shape[0])]
             for rows in blocks:
-                image = view.at(header.omega_deg, *product.shape, block=rows)
+                image = view.at(omega_deg, *product.shape, block=rows)
                 if not image.mask.any():
                     continue
                 if kind == "mueller":
-                    m = np.moveaxis(product.get("mueller", rows), (0, 1), (-2, -1))[image.mask]
-                    values = to_renderer_frames(m, image.points).reshape(-1, 16).T
+                    values = _mueller_values(table, image, product, rows)
                 else:
                     values = _xi0_values(table, image, product)
-                table.add(image.points.angles, values, simulated)
+                table.add(image.points.angles, values, product.simulated)
         if progress:
             progress(done, len(sources))
     if table is None:

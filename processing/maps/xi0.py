@@ -86,7 +86,7 @@ def xi0_of_mueller(source: Path, out: Path, step: Step, overwrite: bool, progres
                     image = MuellerImage.of(product, rows)
                     found = eigenvalue_block(image)
                     if systematic is not None:
-                        set_xi0_systematic(found, _moved(systematic, image))
+                        set_xi0_systematic(found, moved_xi0(systematic, image))
                     writer.write(rows, **found)
                 if progress:
                     progress(rows.stop, product.shape[0])
@@ -146,7 +146,7 @@ def set_xi0_systematic(planes: dict[str, NDArray[Any]], moved: NDArray[np.float6
     planes["xi0_68"] = widened(planes["xi0"], planes["xi0_68"], systematic / NORMAL_95)
 
 
-def _moved(systematic: Systematic, image: MuellerImage) -> NDArray[np.float64]:
+def moved_xi0(systematic: Systematic, image: MuellerImage) -> NDArray[np.float64]:
     """What each direction does to the largest eigenvalue, (D, rows, columns), to first order."""
     xi0, m0 = xi0_and_dominant(image.matrices)
     slope = m0.reshape(*m0.shape[:2], 16).astype(float)

@@ -2,8 +2,8 @@
 
 A `.pbsdf` holds M[phi_d, theta_d, theta_h, wavelength, 4, 4], theta_h quadratic, as a BRDF in 1/sr:
 the cosine of the angle of incidence is divided out. Each matrix refers to the axis s of the facet for both beams
-(docs/conventions.md, "Tables and renderers"): `to_renderer_frames` turns every pixel by its own angles. Directions
-below the surface are NaN there.
+(docs/conventions.md, "Tables and renderers"): `process table` turns every pixel by its own angles. Directions below
+the surface are NaN there.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from processing.arrays import Array
-from processing.geometry.frames import ScatteringGeometry, change_frames
 from processing.geometry.rusinkiewicz import Angles
 from processing.reflectance.table_axes import SHAPE, TableAxes
 from processing.reflectance.tables import ScatteringTable, TableError
@@ -28,11 +27,6 @@ MUELLER = tuple(f"m{i}{j}" for i in range(4) for j in range(4))
 RENDERER_WAVELENGTHS = 5
 
 
-def to_renderer_frames(m: ArrayLike, geometry: ScatteringGeometry) -> Array:
-    """Mueller matrices (N, 4, 4) in the geometry's axes, referred to s for both beams."""
-    return change_frames(m, geometry, geometry.half)
-
-
 def export(
     tables: Sequence[ScatteringTable],
     path: Path | str,
@@ -40,6 +34,7 @@ def export(
     empty: Literal["nearest", "nan"] = "nearest",
     pad_wavelengths: bool = True,
     progress: Callable[[int, int], None] | None = None,
+    uncertainty: bool = False,
 ) -> float:
     """Write a `.pbsdf` of Mueller tables; returns the fraction of visible bins that no sample filled.
 
@@ -51,14 +46,22 @@ def export(
     empty : what goes into visible bins without samples: the nearest filled bin's value, or NaN (black).
     pad_wavelengths : repeat the outer wavelengths up to the 5 that the renderer reads.
     progress : called with wavelengths written and in all.
+    uncertainty
+        Add the field `u`, in the layout of M: standard uncertainty by noise and instrument together, NaN in gaps.
+        Mitsuba ignores it.
 
     Raises
     ------
-    TableError : a table has another layout, other quantities or other frames, or is empty.
+    TableError
+        A table has another layout, other quantities or other frames, is empty, or holds no uncertainty to be added.
     """
     ordered = sorted(tables, key=lambda t: t.wavelength_nm)
     for table in ordered:
         _check(table)
+        if uncertainty and not table.has_noise:
+            raise TableError(
+                f"the table at {table.wavelength_nm:g} nm does not know its noise. Leave --uncertainty away."
+            )
     wavelengths = [round(t.wavelength_nm) for t in ordered]
     slots = list(range(len(ordered)))
     while pad_wavelengths and len(slots) < RENDERER_WAVELENGTHS:
@@ -77,6 +80,7 @@ def export(
             "phi_d": ((1, SHAPE[2]), np.float32),
             "wvls": ((len(slots),), np.uint16),
             "M": (shape, np.float32),
+            **({"u": (shape, np.float32)} if uncertainty else {}),
         },
     )
     fields["theta_h"][0] = np.deg2rad(axes.theta_h_deg)
@@ -85,11 +89,16 @@ def export(
     fields["wvls"][...] = wavelengths
     missing, written = 0.0, 0
     for k, table in enumerate(ordered):
-        block, gaps = _dense(table, white_m00, empty)
+        blocks = {}
+        blocks["M"], gaps = _dense(table, table.mean, white_m00, empty)
+        if uncertainty:
+            total = np.sqrt(sum(np.square(part) for part in table.uncertainties.values()))
+            blocks["u"], _ = _dense(table, total, white_m00, "nan")
         missing = max(missing, gaps)
         for slot, source in enumerate(slots):
             if source == k:
-                fields["M"][..., slot, :, :] = block
+                for name, block in blocks.items():
+                    fields[name][..., slot, :, :] = block
                 written += 1
                 if progress:
                     progress(written, len(slots))
@@ -160,7 +169,8 @@ def _grid() -> tuple[Angles, Array, Array]:
     return Angles(th, td, ph), along - across, along + across
 
 
-def _dense(table: ScatteringTable, white_m00: float, empty: str) -> tuple[NDArray[np.float32], float]:
+def _dense(table: ScatteringTable, values: Array, white_m00: float, empty: str) -> tuple[NDArray[np.float32], float]:
+    # Values (16, bins) of a table in the layout of the file, and the fraction of visible bins without samples.
     _, cos_i, cos_o = _grid()
     visible = (cos_i > 0) & (cos_o > 0)
     row = np.full(SHAPE, -1, dtype=np.int32)
@@ -176,7 +186,7 @@ def _dense(table: ScatteringTable, white_m00: float, empty: str) -> tuple[NDArra
     scale = np.zeros(SHAPE, dtype=np.float32)
     np.divide(1.0, white_m00 * np.pi * cos_i, out=scale, where=visible, casting="unsafe")
     scale[~visible | (row < 0)] = np.nan
-    mean = table.mean.astype(np.float32)
+    mean = values.astype(np.float32)
     out = np.empty((*SHAPE[::-1], 16), dtype=np.float32)
     for q in range(16):
         out[..., q] = (mean[q][row] * scale).transpose(2, 1, 0)

@@ -23,12 +23,18 @@ from processing.storage.captures.nexus import add_group, add_scales, attach, dec
 from processing.storage.integrity.h5_door import damage_as, mark_of, open_h5, require_dataset
 from processing.storage.products.provenance import Step, read_steps, sign, write_steps
 
-#: 1 had everything in the root, without NeXus groups.
-SCHEMA_VERSION = 2
+#: 1 had everything in the root, without NeXus groups; up to 2 the errors were quantities with names of their own.
+SCHEMA_VERSION = 3
 
 
 #: Centres of the bins along each axis, degrees.
 AXES = ("theta_h_deg", "theta_d_deg", "phi_d_deg")
+#: Columns beside the mean of each quantity.
+UNCERTAINTIES = {
+    "u_noise": "standard uncertainty of the mean by noise",
+    "u_systematic": "standard uncertainty of the mean by the instrument's; it does not average",
+}
+_SUMS = ("sum", "sum_of_squares")
 
 
 class TableError(ProcessError):
@@ -45,6 +51,8 @@ class ScatteringTable:
     layout : "degree" or "renderer", see `TableAxes`.
     simulated : whether the values come from a simulation; a table never mixes the two.
     frames : axes to which Mueller elements refer: "instrument", "renderer" or "" for scalars.
+    has_noise : whether samples come with the variance of their noise.
+    inputs : uncertain inputs of the instrument; samples come with what one standard uncertainty of each does to them.
     """
 
     def __init__(
@@ -54,23 +62,29 @@ class ScatteringTable:
         layout: Layout = "degree",
         simulated: bool = False,
         frames: str = "",
+        has_noise: bool = False,
+        inputs: tuple[str, ...] = (),
     ) -> None:
         self.quantities = quantities
         self.wavelength_nm = float(wavelength_nm)
         self.axes = TableAxes(layout)
         self.simulated = simulated
         self.frames = frames
+        self.has_noise = has_noise
+        self.inputs = inputs
         self._row = np.full(SHAPE[0] * SHAPE[1] * SHAPE[2], -1, dtype=np.int32)
         self.bins = np.empty(0, dtype=np.int32)
         self.count = np.empty(0, dtype=np.int64)
         # Bins of the pixels of the last image, filled again by the next: the first touch of new memory is slow.
         self._scratch: NDArray[np.int32] | None = None
-        # Sums and sums of squares, (quantities, bins): double, so that a variance keeps its digits.
-        self._sum = np.empty((len(quantities), 0))
+        # Sums of all planes, sums of squares of the quantities: double, so that a variance keeps its digits.
+        self._sum = np.empty((self.planes, 0))
         self._square = np.empty((len(quantities), 0))
 
     def add(self, angles: Angles, values: ArrayLike, simulated: bool | None = None) -> None:
-        """Add samples: angles (...) in radians and values (quantities, ...); a sample with any NaN is left out.
+        """Add samples: angles (...) in radians and values (planes, ...); a sample with any NaN is left out.
+
+        The planes are the quantities, with `has_noise` the variance of each, then for each of `inputs` all quantities.
 
         Raises
         ------
@@ -84,8 +98,8 @@ class ScatteringTable:
             )
         v = np.asarray(values)
         shape = np.shape(angles.theta_h)
-        if v.shape != (len(self.quantities), *shape):
-            raise TableError(f"expected values of shape {(len(self.quantities), *shape)}, got {v.shape}")
+        if v.shape != (self.planes, *shape):
+            raise TableError(f"expected values of shape {(self.planes, *shape)}, got {v.shape}")
         v = np.ascontiguousarray(v.reshape(len(v), -1))
         if v.dtype not in (np.float32, np.float64):
             v = v.astype(np.float64)
@@ -95,31 +109,60 @@ class ScatteringTable:
         if not np.all(np.isfinite(sums)):
             _drop_unknown(rows, v)
         self._claim(rows)
-        groups = (len(v) + 3) // 4
+        quantities = len(self.quantities)
+        groups, own = (quantities + 3) // 4, v[:quantities]
         total, square, count = self._sum, self._square, self.count
         for_ranges(
-            groups, lambda start, stop: _accumulate(rows, v, total, square, count, start, stop), align=1, smallest=1
+            groups, lambda start, stop: _accumulate(rows, own, total, square, count, start, stop), align=1, smallest=1
         )
+        good = rows >= 0
+        for plane, more in zip(v[quantities:], total[quantities:], strict=True):
+            more += np.bincount(rows[good], plane[good], minlength=count.size)
+
+    @property
+    def planes(self) -> int:
+        """Number of planes of a sample."""
+        return len(self.quantities) * (1 + self.has_noise + len(self.inputs))
 
     @property
     def mean(self) -> Array:
         """(quantities, bins)."""
-        return np.asarray(self._sum / self.count)
+        return np.asarray(self._sum[: len(self.quantities)] / self.count)
 
     @property
     def variance(self) -> Array:
         """(quantities, bins), of the samples in each bin; NaN with one sample."""
-        spread = np.maximum(self._square - self._sum**2 / self.count, 0.0)
+        spread = np.maximum(self._square - self._sum[: len(self.quantities)] ** 2 / self.count, 0.0)
         return np.where(self.count > 1, spread / np.maximum(self.count - 1, 1), np.nan)
 
-    def lookup(self, angles: Angles, min_count: int = 1) -> Array:
-        """Mean (quantities, ...) at directions (...) in radians, of the nearest bin; NaN with too few samples."""
+    @property
+    def directions(self) -> Array:
+        """(inputs, quantities, bins), what one standard uncertainty of each input does to the mean."""
+        moved = self._sum[len(self.quantities) * (1 + self.has_noise) :] / self.count
+        return np.asarray(moved.reshape(len(self.inputs), len(self.quantities), self.count.size))
+
+    @property
+    def uncertainties(self) -> dict[str, Array]:
+        """Standard uncertainties (quantities, bins) of the mean, as far as known: `u_noise`, `u_systematic`."""
+        n, found = len(self.quantities), {}
+        if self.has_noise:
+            found["u_noise"] = np.sqrt(self._sum[n : 2 * n]) / self.count
+        if self.inputs:
+            found["u_systematic"] = np.sqrt(np.square(self.directions).sum(axis=0))
+        return found
+
+    def lookup(self, angles: Angles, min_count: int = 1, of: Array | None = None) -> Array:
+        """Mean (quantities, ...) at directions (...) in radians, of the nearest bin; NaN with too few samples.
+
+        `of` (..., bins) is looked up instead of the mean.
+        """
+        of = self.mean if of is None else of
         bins = self.axes.bins(angles)
         rows = np.where(bins >= 0, self._row[bins], -1)
         if self.bins.size == 0:
-            return np.full((len(self.quantities), *rows.shape), np.nan)
+            return np.full((*of.shape[:-1], *rows.shape), np.nan)
         known = (rows >= 0) & (self.count[rows] >= min_count)
-        return np.where(known, self.mean[:, rows], np.nan)
+        return np.where(known, of[..., rows], np.nan)
 
     def counts(self, angles: Angles) -> NDArray[np.int64]:
         """Number of samples (...) of the bin of each direction."""
@@ -129,8 +172,9 @@ class ScatteringTable:
 
     def merge(self, other: ScatteringTable) -> None:
         """Add all samples of another table of the same quantities, wavelength and layout. Raises TableError."""
-        mine = (self.quantities, self.wavelength_nm, self.axes, self.simulated, self.frames)
-        theirs = (other.quantities, other.wavelength_nm, other.axes, other.simulated, other.frames)
+        mine, theirs = (
+            (t.quantities, t.wavelength_nm, t.axes, t.simulated, t.frames, t.has_noise, t.inputs) for t in (self, other)
+        )
         if mine != theirs:
             raise TableError(f"tables differ and cannot be merged: {mine} and {theirs}")
         rows = other.bins.copy()
@@ -144,10 +188,11 @@ class ScatteringTable:
         found = np.empty(bins.size, dtype=np.int32)
         new = _claim_rows(bins, self._row, self.bins.size, found)
         if new:
-            grown = np.zeros((len(self.quantities), new))
+            grown = np.zeros((self.planes, new))
             self.bins = np.concatenate([self.bins, found[:new]])
             self.count = np.concatenate([self.count, np.zeros(new, dtype=np.int64)])
-            self._sum, self._square = np.hstack([self._sum, grown]), np.hstack([self._square, grown])
+            self._sum = np.hstack([self._sum, grown])
+            self._square = np.hstack([self._square, grown[: len(self.quantities)]])
 
     def save(self, path: Path | str, steps: Sequence[Step] = ()) -> None:
         """Write the filled bins and the axes to HDF5, and the steps that led to them, oldest first.
@@ -162,7 +207,7 @@ class ScatteringTable:
             h5.attrs["layout"] = self.axes.layout
             h5.attrs["simulated"] = self.simulated
             h5.attrs["frames"] = self.frames
-            h5.attrs.update({"quantities": list(self.quantities), "default": "entry"})
+            h5.attrs.update({"quantities": list(self.quantities), "inputs": list(self.inputs), "default": "entry"})
             entry = add_group(h5, "entry", "NXentry")
             entry.attrs.update({"default": "data", "simulated": self.simulated})
             title = f"{', '.join(self.quantities)} over scattering angles, {self.wavelength_nm:g} nm"
@@ -171,7 +216,7 @@ class ScatteringTable:
             describe_light(entry, self.wavelength_nm, "those of the captures in the table")
             self._lay_out_bins(add_group(entry, "data", "NXdata"), title)
             sums = add_group(entry, "sums", "NXcollection")
-            for name, values in (("sum", self._sum), ("sum_of_squares", self._square)):
+            for name, values in zip(_SUMS, (self._sum[: len(self.quantities)], self._square), strict=True):
                 _put(sums, name, values, entry["data"], ("quantity", "bin"), "", f"{name} over the samples of a bin")
             for name in AXES:
                 sums[name] = getattr(self.axes, name)
@@ -194,6 +239,15 @@ class ScatteringTable:
         _put(
             data, "sample_variance", self.variance, data, ("quantity", "bin"), "", "variance of the samples in the bin"
         )
+        for name, text in UNCERTAINTIES.items():
+            if name in self.uncertainties:
+                _put(data, name, self.uncertainties[name], data, ("quantity", "bin"), "", text)
+        if self.inputs:
+            add_scales(data, {"input": len(self.inputs)})
+            data["input_name"] = [name.encode() for name in self.inputs]
+            attach(data["input_name"], data, ["input"])
+            text = "what one standard uncertainty of each uncertain input of the instrument does to the mean"
+            _put(data, "directions", self.directions, data, ("input", "quantity", "bin"), "", text)
         default_plot(data, "mean", ("quantity", "bin"), title)
         data["mean"].attrs["coordinates"] = " ".join([*AXES, "count", "quantity_name"])
         for name in (*AXES, "count"):
@@ -212,15 +266,14 @@ class ScatteringTable:
                 raise TableError(
                     f"{path} has table version {a['umov_table']}; this program reads up to {SCHEMA_VERSION}."
                 )
-            first = int(a["umov_table"]) == 1
-            data, sums = (h5, h5) if first else (h5["entry/data"], h5["entry/sums"])
-            table = cls(
-                tuple(str(q) for q in a["quantities"]),
-                float(a["wavelength_nm"]),
-                a["layout"],
-                bool(a["simulated"]),
-                str(a["frames"]),
-            )
+            version = int(a["umov_table"])
+            data, sums = (h5, h5) if version == 1 else (h5["entry/data"], h5["entry/sums"])
+            names = [str(q) for q in a["quantities"]]
+            quantities, has_noise, inputs = names, "u_noise" in data, [str(i) for i in a.get("inputs", ())]
+            if version < 3 and names[1:2] == ["xi0_variance"]:
+                quantities, has_noise, inputs = names[:1], True, [n.split("_", 3)[3] for n in names[2:]]
+            kind = float(a["wavelength_nm"]), a["layout"], bool(a["simulated"]), str(a["frames"])
+            table = cls(tuple(quantities), *kind, has_noise, tuple(inputs))
             if not np.allclose(sums["theta_h_deg"][...], table.axes.theta_h_deg):
                 raise TableError(f"{path}: its theta_h axis is not that of layout {a['layout']!r}")
             bins = require_dataset(data, "bin", (None,), "i")[...]
@@ -228,8 +281,16 @@ class ScatteringTable:
             if n and not (bins.min() >= 0 and bins.max() < table._row.size and np.unique(bins).size == n):
                 raise ValueError("bins outside the axes, or given twice")
             table.bins, table.count = bins, require_dataset(data, "count", (n,), "i")[...]
-            table._sum = require_dataset(sums, "sum", (q, n), "f")[...]
-            table._square = require_dataset(sums, "sum_of_squares", (q, n), "f")[...]
+            total, square = (require_dataset(sums, name, (len(names), n), "f")[...] for name in _SUMS)
+            if version >= 3:
+                parts = [total]
+                if has_noise:
+                    parts.append(np.square(require_dataset(data, "u_noise", (q, n), "f")[...] * table.count))
+                if inputs:
+                    moved = require_dataset(data, "directions", (len(inputs), q, n), "f")[...]
+                    parts.append((moved * table.count).reshape(-1, n))
+                total = np.concatenate(parts)
+            table._sum, table._square = total, square[:q]
         table._row[table.bins] = np.arange(table.bins.size, dtype=np.int32)
         return table
 

@@ -15,12 +15,9 @@ from processing.storage.products.provenance import steps_text
 
 
 def table_section(path: Path) -> Section:
-    """Numbers of a table, and its first quantity over theta_h and theta_d, averaged over phi_d."""
+    """Numbers of a table, its first quantity over theta_h and theta_d, averaged over phi_d, and its uncertainties."""
     table = ScatteringTable.load(path)
     name = table.quantities[0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        stderr = np.sqrt(table.variance[0] / table.count) if table.bins.size else np.empty(0)
-    known = stderr[np.isfinite(stderr)]
     summary = [
         ("kind", f"table over theta_h, theta_d, phi_d, {'simulated' if table.simulated else 'measured'}"),
         ("quantities", ", ".join(table.quantities)),
@@ -28,19 +25,24 @@ def table_section(path: Path) -> Section:
         ("layout", table.axes.layout),
         ("bins filled", f"{table.bins.size} of {SHAPE[0] * SHAPE[1] * (SHAPE[2] - 1)}"),
         ("samples", str(int(table.count.sum()))),
-        (
-            f"standard error of a bin's mean {name}, median",
-            f"{np.median(known):.3g}" if known.size else "not known: no bin has two samples",
+        ("uncertain in the instrument", "; ".join(table.inputs) or "nothing stated"),
+        *(
+            (f"{part} of a bin's mean {name}, median", f"{np.nanmedian(values[0]):.3g}")
+            for part, values in table.uncertainties.items()
+            if table.bins.size
         ),
     ]
     notes = [("provenance, oldest first", steps_text(table_steps(path)))] if table_steps(path) else []
     if not table.bins.size:
         return Section(path.name, summary, notes=notes)
-    mean, count = _over_phi(table)
+    mean, count = _over_phi(table, table.mean[0])
+    spread = {"cmap": "magma", "origin": "lower"}
+    parts = [(part, _over_phi(table, values[0])[0], spread) for part, values in table.uncertainties.items()]
     drawn = map_figure(
         [
             (f"{name}, mean over $\\phi_d$", mean, {"cmap": "viridis", "origin": "lower"}),
-            ("samples (log10)", count, {"cmap": "magma", "origin": "lower"}),
+            *parts,
+            ("samples (log10)", count, spread),
         ],
         f"{path.name}: rows $\\theta_h$, columns $\\theta_d$, bins",
         table.simulated,
@@ -49,12 +51,12 @@ def table_section(path: Path) -> Section:
     return Section(path.name, summary, [figure], notes=notes)
 
 
-def _over_phi(table: ScatteringTable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _over_phi(table: ScatteringTable, values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     # Samples count alike, so bins with many of them count more.
     plane = table.bins // SHAPE[2]
     size = SHAPE[0] * SHAPE[1]
     count = np.bincount(plane, weights=table.count, minlength=size)
-    total = np.bincount(plane, weights=table.mean[0] * table.count, minlength=size)
+    total = np.bincount(plane, weights=values * table.count, minlength=size)
     with np.errstate(divide="ignore", invalid="ignore"):
         mean, samples = total / count, np.where(count > 0, np.log10(count), np.nan)
     return mean.reshape(SHAPE[:2]), samples.reshape(SHAPE[:2])

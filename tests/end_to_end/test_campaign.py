@@ -173,7 +173,7 @@ def test_tables_compared_by_hand_give_the_campaigns_number(here, configs, proces
     for row in here.rows:
         line = next(text for text in out.splitlines() if text.strip().startswith(f"{row.omega_deg:g} "))
         assert [float(v) for v in line.split()[1:]] == pytest.approx(
-            [row.xi0_percent, row.xi0_noise_percent, row.common], abs=6e-4
+            [row.xi0_percent, row.xi0_noise_percent, row.xi0_systematic_percent, row.common], abs=6e-4
         )
     assert (tmp_path / "f.png").stat().st_size > 10_000
     code, _, err = process("compare-tables", *tables, *rest, "--omega", "x")

@@ -100,8 +100,8 @@ def laid_out(folder: Path) -> list[Path]:
 
 
 def table(path: Path) -> Path:
-    bins = ScatteringTable(("xi0", "m00"), 662, simulated=True)
-    bins.add(Angles(*np.random.default_rng(5).uniform(0, 0.5, (3, 400))), np.ones((2, 400)))
+    bins = ScatteringTable(("xi0", "m00"), 662, simulated=True, has_noise=True, inputs=("analyzer.azimuth_deg",))
+    bins.add(Angles(*np.random.default_rng(5).uniform(0, 0.5, (3, 400))), np.ones((6, 400)))
     bins.save(path)
     return path
 

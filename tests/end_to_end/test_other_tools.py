@@ -47,10 +47,11 @@ def product(capture) -> Path:
 @pytest.fixture
 def table(tmp_path):
     rng = np.random.default_rng(5)
-    bins = ScatteringTable(("xi0", "xi0_variance"), 662, "renderer", simulated=True)
+    inputs = ("psg_retarder.retardance_deg", "analyzer.azimuth_deg")
+    bins = ScatteringTable(("xi0",), 662, "renderer", simulated=True, has_noise=True, inputs=inputs)
     angles = Angles(*(rng.uniform(0, most, 400) for most in (0.5, 1.2, 3.0)))
-    bins.add(angles, rng.normal(0.8, 0.05, (2, 400)))
-    bins.add(Angles(*(angle[:200] for angle in angles)), rng.normal(0.8, 0.05, (2, 200)))
+    bins.add(angles, rng.normal(0.8, 0.05, (4, 400)))
+    bins.add(Angles(*(angle[:200] for angle in angles)), rng.normal(0.8, 0.05, (4, 200)))
     bins.save(tmp_path / "table.h5")
     return tmp_path / "table.h5"
 
@@ -80,6 +81,10 @@ def test_xarray_sees_the_bins_of_a_scattering_table(table):
         assert [*bins["quantity_name"].values.astype(str)] == list(there.quantities)
         np.testing.assert_array_equal(bins["mean"], there.mean)
         np.testing.assert_array_equal(bins["sample_variance"], there.variance)
+        assert bins["directions"].dims == ("input", "quantity", "bin")
+        assert [*bins["input_name"].values.astype(str)] == list(there.inputs)
+        for name, values in there.uncertainties.items():
+            np.testing.assert_allclose(bins[name], values, rtol=1e-14)
         np.testing.assert_array_equal(bins["bin"], there.bins)
         at = Angles(*(np.deg2rad(bins[name].values) for name in ("theta_h_deg", "theta_d_deg", "phi_d_deg")))
         np.testing.assert_array_equal(there.axes.bins(at), there.bins)
@@ -262,17 +267,19 @@ def test_an_exported_scattering_table_reads_back_exactly(tmp_path, table, capsys
     read = pandas.read_csv(path, comment="#")
     assert [*read.columns] == [
         "theta_h_deg", "theta_d_deg", "phi_d_deg", "samples",
-        "xi0", "xi0_sample_variance", "xi0_variance", "xi0_variance_sample_variance",
+        "xi0", "xi0_u_noise", "xi0_u_systematic", "xi0_sample_variance",
     ]  # fmt: skip
     there = Angles(*(np.deg2rad(read[name]) for name in ("theta_h_deg", "theta_d_deg", "phi_d_deg")))
     assert len(read) == table.bins.size
     np.testing.assert_array_equal(table.counts(there), read["samples"])
-    np.testing.assert_array_equal(table.lookup(there), [read["xi0"], read["xi0_variance"]])
+    np.testing.assert_array_equal(table.lookup(there)[0], read["xi0"])
     order = np.argsort(table.bins)
+    for name, values in table.uncertainties.items():
+        np.testing.assert_array_equal(values[0, order], read[f"xi0_{name}"])
     np.testing.assert_array_equal(table.variance[:, order][0], read["xi0_sample_variance"])
 
     assert _process("export", tmp_path / "table.h5", "--to", "csv", "--plane", "xi1", "--overwrite") == 2
-    assert "has no 'xi1'; it has: xi0, xi0_variance" in capsys.readouterr().err
+    assert "has no 'xi1'; it has: xi0" in capsys.readouterr().err
     assert _process("export", tmp_path / "table.h5", "--to", "fits") == 2
     assert "is a scattering table: it goes into csv" in capsys.readouterr().err
 

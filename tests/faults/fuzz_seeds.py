@@ -225,8 +225,8 @@ def _product(path: Path) -> str | None:
 def _table_files(folder: Path) -> Sequence[Path]:
     from processing.geometry.rusinkiewicz import Angles
 
-    table = ScatteringTable(("xi0", "xi0_variance"), 662)
-    table.add(Angles(*(np.linspace(0.1, 1.0, 50) for _ in range(3))), np.ones((2, 50)))
+    table = ScatteringTable(("xi0",), 662, has_noise=True, inputs=("analyzer.azimuth_deg",))
+    table.add(Angles(*(np.linspace(0.1, 1.0, 50) for _ in range(3))), np.ones((3, 50)))
     table.save(folder / "xi0.table.h5")
     return [folder / "xi0.table.h5"]
 

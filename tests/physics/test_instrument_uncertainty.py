@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from processing.campaign.run import compare_on_sphere
 from processing.commands.application import app
 from processing.errors import ProcessError
+from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.instrument.uncertainty import value_directions
@@ -16,6 +18,7 @@ from processing.maps.xi0 import dominant_model, xi0_of_mueller
 from processing.polarization import mueller, triply_degenerate
 from processing.reduction.mueller import reduce_mueller
 from processing.reduction.stokes import reduce_stokes
+from processing.reflectance.tables import ScatteringTable
 from processing.storage.captures.capture import Capture
 from processing.storage.products.product import Product, Step
 from processing.yaml_file import ConfigError, parse_yaml
@@ -159,15 +162,56 @@ def test_a_table_holds_what_each_direction_does_to_its_means(stated, synthetic_c
     geometry = configs / "geometries/one_inch_sphere.yaml"
     paths = products(synthetic_capture, tmp_path, model, model, np.random.default_rng(4), **header)
     table = tabulate([paths[2]], geometry, "degree")
-    assert [name.split("_", 3)[3] for name in table.quantities[2:]] == list(model.stderr)
-    of_mean = np.sqrt(np.square(table.mean[2:]).sum(axis=0))
+    assert table.inputs == tuple(model.stderr)
     with Product(paths[2]) as product:
         of_pixel = np.median(product.get("xi0_systematic"))
-    assert np.median(of_mean) == pytest.approx(of_pixel, rel=0.05)
+    assert np.median(table.uncertainties["u_systematic"]) == pytest.approx(of_pixel, rel=0.05)
     known = model.model_copy(update={"stderr": {}})
     plain = products(synthetic_capture, tmp_path, known, known, None, "plain", **header)
     with pytest.raises(ProcessError, match="process reduce --instrument"):
         tabulate([plain[2]], geometry, "degree", table)
+
+
+def test_a_mueller_table_covers_an_instrument_that_is_off_and_its_noise(stated, synthetic_capture, tmp_path, configs):
+    """One uncertain value off by u moves every element of every bin by its direction; the noise is that of repeats."""
+    model = InstrumentModel.load(stated).at(662)
+    known = model.model_copy(update={"stderr": {}})
+    off = model.with_values({"psg_retarder": {"retardance_deg": model.value_of("psg_retarder.retardance_deg") + 0.3}})
+    geometry, header = configs / "geometries/one_inch_sphere.yaml", {"omega_deg": 35.0, "rows": 32}
+
+    def table(used, truth, random, name):
+        paths = products(synthetic_capture, tmp_path, used, truth, random, name, **header)
+        return tabulate(paths[:1], geometry, "renderer")
+
+    exact, moved, told = table(known, known, None, "e"), table(known, off, None, "m"), table(model, known, None, "t")
+    assert set(exact.uncertainties) == {"u_noise"}
+    one = told.directions[told.inputs.index("psg_retarder.retardance_deg")]
+    # What the instrument really does is the opposite of what a wrong file does.
+    shift = moved.mean / moved.mean[0] - exact.mean / exact.mean[0]
+    assert np.abs(shift).max() > 1e-3
+    assert -one / told.mean[0] == pytest.approx(shift, rel=0.02, abs=1e-5)
+    assert np.all(told.uncertainties["u_systematic"] ** 2 >= one**2)
+    random = np.random.default_rng(1)
+    repeats = [table(known, known, random, f"n{k}") for k in range(24)]
+    pulls = [(r.mean - exact.mean) / r.uncertainties["u_noise"] for r in repeats]
+    # 24 repeats of some 100 bins in each element.
+    assert np.sqrt(np.mean(np.square(pulls), axis=(0, 2))) == pytest.approx(np.ones(16), abs=0.1)
+
+
+def test_compared_tables_share_the_error_of_one_instrument(configs):
+    """It is in their difference as far as it differs; two instruments add."""
+    view = ViewingGeometry.load(configs / "geometries/one_inch_sphere.yaml")
+    angles = view.at(35.0, 60, 60).points.angles
+
+    def table(value, moved, label):
+        made = ScatteringTable(("xi0",), 662, has_noise=True, inputs=(label,))
+        made.add(angles, np.broadcast_to(np.array([[value], [0.0], [moved]]), (3, angles.theta_h.size)))
+        return made
+
+    for other, expected in (("analyzer", 1.0), ("micropolarizer", np.hypot(3.0, 4.0))):
+        found = compare_on_sphere(table(0.5, 0.03, "analyzer"), table(0.6, 0.04, other), view, 35.0, (60, 60))
+        assert found["xi0_percent"] == pytest.approx(10)
+        assert found["xi0_systematic_percent"] == pytest.approx(expected)
 
 
 def test_an_extrapolated_matrix_and_its_quantities_have_the_instruments_part(configs, synthetic_capture, tmp_path):

@@ -79,8 +79,9 @@ def test_not_a_number_and_empty_bins():
 
 def test_file_round_trip_keeps_growing_and_merging(tmp_path):
     a, b = random_angles(400, 1), random_angles(400, 2)
-    va, vb = np.random.default_rng(3).normal(size=(2, 1, 400))
-    whole, part, other = (ScatteringTable(("xi0",), 451, "renderer", True) for _ in range(3))
+    va, vb = np.random.default_rng(3).uniform(size=(2, 4, 400))
+    kind = {"has_noise": True, "inputs": ("polarizer", "analyzer")}
+    whole, part, other = (ScatteringTable(("xi0",), 451, "renderer", True, **kind) for _ in range(3))
     whole.add(a, va)
     whole.add(b, vb)
     part.add(a, va)
@@ -91,27 +92,37 @@ def test_file_round_trip_keeps_growing_and_merging(tmp_path):
     assert (loaded.wavelength_nm, loaded.axes.layout, loaded.simulated) == (451, "renderer", True)
     probe = random_angles(500, 4)
     np.testing.assert_allclose(loaded.lookup(probe), whole.lookup(probe))
+    for name, values in whole.uncertainties.items():
+        np.testing.assert_allclose(loaded.uncertainties[name], values)
     with h5py.File(tmp_path / "t.h5") as h5:
         np.testing.assert_allclose(h5["entry/sums/theta_h_deg"][...], 90 * (np.arange(91) / 90) ** 2)
 
 
-def test_a_table_of_the_first_version_is_read(tmp_path):
-    """It had all arrays in the root."""
-    table = ScatteringTable(("xi0",), 451, "renderer", True)
-    table.add(random_angles(400, 1), np.random.default_rng(3).normal(size=(1, 400)))
-    table.save(tmp_path / "t.h5", steps=[Step("table", {})])
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_table_of_an_earlier_version_is_read(tmp_path, version):
+    """Variance and directions were quantities; the first had all arrays in the root."""
+    names, values = ("xi0", "xi0_variance", "xi0_direction_0_analyzer"), np.random.default_rng(3).uniform(size=(3, 400))
+    table = ScatteringTable(("xi0",), 451, "renderer", True, has_noise=True, inputs=("analyzer",))
+    earlier = ScatteringTable(names, 451, "renderer", True)
+    for each in (table, earlier):
+        each.add(random_angles(400, 1), values)
+    earlier.save(tmp_path / "t.h5", steps=[Step("table", {})])
     with h5py.File(tmp_path / "t.h5", "r+") as h5:
-        for name in ("data/bin", "data/count", "sums/sum", "sums/sum_of_squares", "sums/theta_h_deg", "process_1"):
-            h5.copy(f"entry/{name}", h5, name.split("/")[-1])
-        del h5["entry"]
-        h5.attrs["umov_table"] = 1
+        h5.attrs["umov_table"] = version
+        if version == 1:
+            for name in ("data/bin", "data/count", "sums/sum", "sums/sum_of_squares", "sums/theta_h_deg", "process_1"):
+                h5.copy(f"entry/{name}", h5, name.split("/")[-1])
+            del h5["entry"]
     loaded = ScatteringTable.load(tmp_path / "t.h5")
-    np.testing.assert_array_equal(loaded.mean, table.mean)
-    np.testing.assert_array_equal(loaded.variance, table.variance)
+    assert (loaded.quantities, loaded.inputs) == (("xi0",), ("analyzer",))
+    for one, other in ((loaded.mean, table.mean), (loaded.variance, table.variance)):
+        np.testing.assert_array_equal(one, other)
+    for name in ("u_noise", "u_systematic"):
+        np.testing.assert_array_equal(loaded.uncertainties[name], table.uncertainties[name])
     assert [step.name for step in table_steps(tmp_path / "t.h5")] == ["table"]
     with h5py.File(tmp_path / "t.h5", "r+") as h5:
-        h5.attrs["umov_table"] = 3
-    with pytest.raises(TableError, match="table version 3; this program reads up to 2"):
+        h5.attrs["umov_table"] = 4
+    with pytest.raises(TableError, match="table version 4; this program reads up to 3"):
         ScatteringTable.load(tmp_path / "t.h5")
 
 

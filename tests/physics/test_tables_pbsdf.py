@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from processing.geometry.frames import cross, unit
+from processing.geometry.frames import change_frames, cross, unit
 from processing.geometry.rusinkiewicz import Angles, directions
 from processing.reflectance import fresnel, pbsdf
 from processing.reflectance.base import normalized_mueller
@@ -17,7 +17,7 @@ from simulators.conformance.reflectance import random_geometry
 def test_in_renderer_frames_first_surface_reflection_is_a_plain_fresnel_matrix():
     # In (s, p) axes of both beams F is diag(r_s, r_p), whatever the pixel: no fixed turn of all pixels does that.
     g = random_geometry(200)
-    m = pbsdf.to_renderer_frames(normalized_mueller(fresnel.jones(g, 1.5 + 0.3j)), g)
+    m = change_frames(normalized_mueller(fresnel.jones(g, 1.5 + 0.3j)), g, g.half)
     rs, rp = fresnel.amplitudes(1.5 + 0.3j, g.angles.theta_d)
     s, p = np.abs(rs) ** 2, np.abs(rp) ** 2
     np.testing.assert_allclose(m[:, 0, 1], (s - p) / (s + p), atol=1e-10)
@@ -97,7 +97,7 @@ def test_export_and_import_give_the_filled_bins_back(tmp_path):
 def test_empty_bins_take_the_nearest_value_around_the_circle():
     one = np.deg2rad([[10.0, 20.0, 179.0], [10.0, 20.0, 0.0]]).T
     table = mueller_table(Angles(*one), np.stack([np.full(16, 1.0), np.full(16, 2.0)], axis=-1))
-    dense, gaps = pbsdf._dense(table, 1.0, "nearest")
+    dense, gaps = pbsdf._dense(table, table.mean, 1.0, "nearest")
     _, cos_i, _ = pbsdf._grid()
     i, j = round(90 * np.sqrt(10 / 90)), 20
     got = dense[:, j, i, 0, 0] * np.pi * cos_i[i, j]
@@ -105,6 +105,19 @@ def test_empty_bins_take_the_nearest_value_around_the_circle():
     # phi_d = -170 is 11 degrees from 179, the other way round.
     assert got[[10, 180, 350, 0, 360]] == pytest.approx([1, 2, 1, 1, 1])
     assert np.isnan(dense[0, 90, 45]).all()
+
+
+def test_the_uncertainty_of_each_element_is_exported_where_there_are_samples(tmp_path):
+    table = ScatteringTable(pbsdf.MUELLER, 662, "renderer", frames="renderer", has_noise=True, inputs=("analyzer",))
+    one = Angles(np.array([0.0]), np.array([0.0]), np.array([0.0]))
+    table.add(one, np.repeat([1.0, 0.03**2, 0.04], 16)[:, None])
+    pbsdf.export([table], tmp_path / "m.pbsdf", white_m00=2.0, uncertainty=True, pad_wavelengths=False)
+    fields = read_tensor_file(tmp_path / "m.pbsdf")
+    assert fields["u"][180, 0, 0, 0] * 2 * np.pi == pytest.approx(np.full((4, 4), 0.05))
+    assert np.isfinite(fields["u"]).sum() == 16
+    assert np.isfinite(fields["M"]).sum() > 1e6
+    with pytest.raises(TableError, match="does not know its noise"):
+        pbsdf.export([mueller_table(one, np.ones((16, 1)))], tmp_path / "n.pbsdf", uncertainty=True)
 
 
 def test_only_what_the_renderer_expects_is_exported(tmp_path):
