@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +14,30 @@ from processing.doors import require_distinct
 from processing.errors import ProcessError
 from processing.geometry.frames import ScatteringGeometry
 from processing.geometry.viewing import ViewingGeometry
+from processing.maps.stokes_vector import moves_of_light
 from processing.reduction.sent_light import sent_rows
+from processing.reduction.systematic import Systematic
 from processing.reflectance.material_fit import MaterialFit, fit_values
 from processing.storage.products.images import SMALLEST, MuellerImage, StokesImage
 from processing.storage.products.product import Product
 
-#: Points, values (K, N), rows (K, 16) and covariance (N, K, K).
-_Data = tuple[ScatteringGeometry, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+
+class _Data(NamedTuple):
+    """Pixels of one product or of several: values (K, N), rows (K, 16) and covariance (N, K, K) of the values.
+
+    Attributes
+    ----------
+    inputs, moved : uncertain inputs of the instrument, and values and rows with one standard uncertainty of each.
+    """
+
+    points: ScatteringGeometry
+    values: NDArray[np.float64]
+    rows: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    inputs: tuple[str, ...]
+    moved: list[tuple[NDArray[np.float64], NDArray[np.float64]]]
+
+
 #: At most so many pixels of each image go into a fit.
 PIXELS = 3000
 #: Pixels nearer than this to the outline are left out: the default demosaicing reaches across it.
@@ -55,28 +73,49 @@ def fit_products(
     if len(simulated) > 1:
         raise ProcessError("simulated and measured products were given together; fit them one by one.")
     view = ViewingGeometry.load(geometry_file)
-    points, data, rows, covariance = (_of_mueller if kinds == {"mueller"} else _of_stokes)(sources, view)
-    fit = fit_values(points, data, rows, covariance, max_pixels=len(covariance), correlation=correlation)
+    read = _of_mueller if kinds == {"mueller"} else _of_stokes
+    each = [read(source, view) for source in sources]
+    first = each[0]
+    for source, data in zip(sources, each, strict=True):
+        if data.rows.shape != first.rows.shape or not np.allclose(data.rows, first.rows, atol=ALIKE):
+            raise ProcessError(f"{source} determines something else than the first product, or under other light.")
+        if data.inputs != first.inputs:
+            raise ProcessError(
+                f"{source} was reduced with other uncertain values than {sources[0]}. Reduce all captures with one "
+                "file: process reduce --instrument FILE"
+            )
+    if len(first.rows) < LEAST_VALUES:
+        raise ProcessError(f"a fit needs {LEAST_VALUES} elements of M or more; see what `process reduce` determined.")
+    moved = [
+        (np.concatenate([data.moved[k][0] for data in each], axis=1), first.moved[k][1])
+        for k in range(len(first.inputs))
+    ]
+    fit = fit_values(
+        _joined([data.points for data in each]),
+        np.concatenate([data.values for data in each], axis=1),
+        first.rows,
+        np.concatenate([data.covariance for data in each]),
+        max_pixels=sum(len(data.covariance) for data in each),
+        correlation=correlation,
+        moved=moved,
+    )
     return fit, float(wavelengths.pop()), simulated.pop()
 
 
-def _of_mueller(sources: Sequence[Path], view: ViewingGeometry) -> _Data:
-    parts, data, covariances = [], [], []
-    rows: NDArray[np.float64] | None = None
-    for source in sources:
-        with Product(source) as product:
-            points, index = _sample(view, product)
-            image = MuellerImage.of(product).at(index)
-        values, seen = determined_values(image)
-        if rows is not None and (rows.shape != seen.shape or not np.allclose(rows, seen, atol=ALIKE)):
-            raise ProcessError(f"{source} determines something else of M than the first product.")
-        rows = seen
-        parts.append(points)
-        data.append(values)
-        covariances.append(covariance_by_light(image, seen))
-    if rows is None or len(rows) < LEAST_VALUES:
-        raise ProcessError(f"a fit needs {LEAST_VALUES} elements of M or more; see what `process reduce` determined.")
-    return _joined(parts), np.concatenate(data, axis=1), rows, np.concatenate(covariances)
+def _of_mueller(source: Path, view: ViewingGeometry) -> _Data:
+    with Product(source) as product:
+        points, index = _sample(view, product)
+        image, systematic = MuellerImage.of(product).at(index), Systematic.of_product(product)
+    values, rows = determined_values(image)
+    moved, inputs = [], () if systematic is None else systematic.labels
+    if systematic is not None:
+        seen = image.seen if image.sent is None else np.repeat(np.isfinite(image.sent).any(axis=(1, 2)), 4)
+        seen = seen if image.sent is None else seen & (np.arange(16) % 4 == 0)
+        moves = moves_of_light(systematic, image).reshape(len(inputs), 16, -1)[:, seen]
+        for direction, move in zip(systematic.directions, moves, strict=True):
+            own = rows if image.sent is None else sent_rows(direction.rows)[seen[::4]]
+            moved.append((values + move, own))
+    return _Data(points, values, rows, covariance_by_light(image, rows), inputs, moved)
 
 
 def determined_values(image: MuellerImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -110,23 +149,26 @@ def covariance_by_light(image: MuellerImage, rows: NDArray[np.float64]) -> NDArr
     return np.asarray(np.einsum("np,in,jn->pij", variance, solve, solve, optimize=True))
 
 
-def _of_stokes(sources: Sequence[Path], view: ViewingGeometry) -> _Data:
-    parts, signals, covariances = [], [], []
-    w = analyzers = None
-    for source in sources:
-        with Product(source) as product:
-            points, index = _sample(view, product)
-        image = StokesImage.load(source)
-        if w is not None and not np.allclose(w, image.w):
-            raise ProcessError(f"{source} was taken with another generator state than the first product.")
-        w, analyzers = image.w, image.analyzers
-        parts.append(points)
-        signals.append(image.values.reshape(3, -1)[:, index].astype(float))
-        covariances.append(image.covariance.reshape(-1, 3, 3)[index].astype(float))
-    if w is None or analyzers is None:
-        raise ProcessError("no product was given; there is nothing to fit.")
-    rows = np.linalg.pinv(analyzers) @ w
-    return _joined(parts), np.concatenate(signals, axis=1), rows, np.concatenate(covariances)
+def _of_stokes(source: Path, view: ViewingGeometry) -> _Data:
+    with Product(source) as product:
+        points, index = _sample(view, product)
+        systematic = Systematic.of_product(product)
+    image = StokesImage.load(source)
+    values = image.values.reshape(3, -1)[:, index].astype(float)
+    covariance = image.covariance.reshape(-1, 3, 3)[index].astype(float)
+    moved, inputs = [], () if systematic is None else systematic.labels
+    if systematic is not None:
+        for direction, move in zip(systematic.directions, systematic.moves(values), strict=True):
+            moved.append((values + move, stokes_rows(direction.rows)))
+    return _Data(points, values, stokes_rows(image.w), covariance, inputs, moved)
+
+
+def stokes_rows(w: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rows (3, 16) that lead from M to the linear Stokes vector that analyzers without S3 find, of W (channels, 16)."""
+    light = np.linalg.svd(w.reshape(-1, 4), full_matrices=False)[2][0]
+    light /= light[0]
+    analyzers = (w.reshape(-1, 4, 4) @ light)[:, :3] / (light @ light)
+    return np.asarray(np.linalg.pinv(analyzers) @ w)
 
 
 def _sample(view: ViewingGeometry, product: Product) -> tuple[ScatteringGeometry, np.ndarray]:

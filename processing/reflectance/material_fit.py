@@ -52,10 +52,11 @@ class MaterialFit:
     covariance : (4, 4); NaN for a constant at its bound. From the scatter of whole pixels, of blocks of them where the
         model does not describe the data; it holds noise and misfit, not errors of the geometry.
     departure : (4, 4), covariance by small eigenvalues that differ; zero where they do not matter.
+    systematic : (4, 4), covariance by the instrument's uncertainty; zero where none is stated.
     identified : which constants the data fix at all; an unidentified one may be anything.
     correlation : mean linear correlation between data and model; NaN for the dominant process.
     residual : root mean square of the residual over that of the data's polarized part; NaN likewise.
-    chi_square : what the model does not describe over the noise, 1 if it is noise alone.
+    chi_square : what neither the model nor the instrument's uncertainty describes, over the noise; 1: noise alone.
     describes : whether noise makes such a chi-square.
     method : "dominant process" or "linear correlation".
     """
@@ -63,6 +64,7 @@ class MaterialFit:
     constants: Array
     covariance: Array
     departure: Array
+    systematic: Array
     identified: dict[str, bool]
     condition: float
     residual: float
@@ -75,7 +77,7 @@ class MaterialFit:
     @property
     def stderr(self) -> Array:
         """(4,), standard errors."""
-        return np.asarray(np.sqrt(np.diag(self.covariance + self.departure)))
+        return np.asarray(np.sqrt(np.diag(self.covariance + self.departure + self.systematic)))
 
     def notes(self, sources: Sequence[str]) -> list[str]:
         """Lines for the material file: where the constants come from, their errors and correlations."""
@@ -88,7 +90,7 @@ class MaterialFit:
         return [
             f"fitted to {', '.join(sources)} by the {self.method}",
             f"{self.pixels} pixels, condition number {self.condition:.3g}",
-            f"standard errors: {errors} (noise and misfit, not errors of the geometry)",
+            f"standard errors: {errors} (noise, misfit and instrument, not errors of the geometry)",
             *self._doubts,
             f"correlations: {between or 'not known'}",
             *([f"NOT IDENTIFIED by these data: {lost}"] if lost else []),
@@ -99,11 +101,11 @@ class MaterialFit:
         out = []
         if not self.describes:
             out.append(f"THE MODEL DOES NOT DESCRIBE THESE DATA: reduced chi-square {self.chi_square:.3g}")
-        if self.departure.any():
-            by = ", ".join(f"{n} {e:.2g}" for n, e in zip(NAMES, np.sqrt(np.diag(self.departure)), strict=True))
-            out.append(
-                f"of these, small eigenvalues {250 * DEPARTURE:.0f} % apart: {by}; a Mueller image does not have it"
-            )
+        apart = f"small eigenvalues {250 * DEPARTURE:.0f} % apart, which a Mueller image does not have"
+        for what, part in ((apart, self.departure), ("the instrument's uncertainty", self.systematic)):
+            if part.any():
+                by = ", ".join(f"{n} {e:.2g}" for n, e in zip(NAMES, np.sqrt(np.diag(part)), strict=True))
+                out.append(f"of these, {what}: {by}")
         return out
 
     def model(self, name: str, wavelength_nm: float) -> polarized_diffuse.Model:
@@ -121,6 +123,7 @@ def fit_values(
     max_pixels: int = 5000,
     *,
     correlation: bool = False,
+    moved: Sequence[tuple[ArrayLike, ArrayLike]] = (),
 ) -> MaterialFit:
     """Constants from values that are linear in M, with correlated noise: Mueller elements or Stokes vectors.
 
@@ -132,6 +135,7 @@ def fit_values(
         noise; the level of the light alone is enough.
     max_pixels : use at most so many, evenly spread.
     correlation : by linear correlation, also where all elements are given.
+    moved : values and rows of the same pixels with one standard uncertainty of each uncertain input of the instrument.
 
     Raises
     ------
@@ -142,41 +146,65 @@ def fit_values(
     # The ridge is for values without noise.
     c = c[keep] + 1e-9 * np.trace(c[keep], axis1=1, axis2=2)[:, None, None] * np.eye(len(x))
     model = _Forward(geometry[keep])
+    others = [(np.asarray(v, dtype=float)[:, keep], np.asarray(w, dtype=float)) for v, w in moved]
     if not correlation and np.linalg.matrix_rank(r) == 16:
         back = np.linalg.pinv(r)
-        return _fit_dominant(model, (back @ x[:, keep]).T, back @ c @ back.T)
+        each = [(np.linalg.pinv(w) @ v).T for v, w in others]
+        return _fit_dominant(model, (back @ x[:, keep]).T, back @ c @ back.T, each)
     whiten = np.linalg.inv(np.linalg.cholesky(c))
-    return _fit_correlation(model, np.einsum("nij,jn->ni", whiten, x[:, keep]), whiten @ r)
+    own, *rest = (_Correlation.of(model, v, w, whiten) for v, w in [(x[:, keep], r), *others])
+    return _fit_correlation(own, rest)
 
 
-def _fit_dominant(model: _Forward, data: Array, covariance: Array) -> MaterialFit:
-    """Fit Mueller matrices (N, 16), whose noise has the covariance (N, 16, 16)."""
+def _fit_dominant(model: _Forward, data: Array, covariance: Array, moved: Sequence[Array]) -> MaterialFit:
+    """Fit Mueller matrices (N, 16), whose noise has the covariance (N, 16, 16); `moved` are the same by an instrument
+    that is off.
+    """
     from scipy.optimize import minimize
 
     level = np.maximum(data[:, 0], 0.0)
     # M/m00 weighs as m00^2 over its variance; <M, m0> has one m00 of it.
     weight = level / np.trace(covariance, axis1=1, axis2=2)
-    scaled = data * (weight / np.sum(weight * level))[:, None]
+    weight = (weight / np.sum(weight * level))[:, None]
+    scaled = data * weight
 
     def unlike(q: Array) -> float:
         return -float(np.sum(scaled * model.mueller(q).reshape(-1, 16)))
 
     bounds = list(zip(LOWER.tolist(), UPPER.tolist(), strict=True))
     fits = [minimize(unlike, np.array(s), method="L-BFGS-B", bounds=bounds, tol=1e-13) for s in STARTS]
-    found = np.asarray(min(fits, key=lambda fit: float(fit.fun)).x)
+    # The search ends where its sum stops changing; the root of its slope is sharper.
+    found = _root(model, np.asarray(min(fits, key=lambda fit: float(fit.fun)).x), scaled)
+    off = np.array([_root(model, found, other * weight) - found for other in moved]).reshape(-1, 4)
+    scores, curvature = _slopes(model, found, scaled)
+    parts = _neighbours(model.mueller(found).reshape(-1, 16))
+    noise = np.einsum("nki,nij,nlj->nkl", parts, covariance, parts, optimize=True)
+    whiten = np.linalg.inv(np.linalg.cholesky(noise)) @ parts
+    seen, *changes = (np.einsum("nki,ni->nk", whiten, values) for values in (data, *moved))
+    square = _unexplained(seen, [change - seen for change in changes])
+    return _result(found, -curvature.sum(axis=0), scores, square, 6 * len(data) - 4, "dominant process", off)
+
+
+def _root(model: _Forward, start: Array, scaled: Array) -> Array:
+    """Constants near to `start` at which the slope of sum(scaled * m0) is zero."""
+    found = start.copy()
     for _ in range(2):
-        # The search ends where its sum stops changing; the root of its slope is sharper.
         slope, curvature = (np.sum(part, axis=0) for part in _slopes(model, found, scaled))
         inside = (found > LOWER + NEAR * (UPPER - LOWER)) & (found < UPPER - NEAR * (UPPER - LOWER))
         if inside.any():
             step = np.linalg.lstsq(curvature[np.ix_(inside, inside)], slope[inside], rcond=1e-10)[0]
             found[inside] = np.clip(found[inside] - step, LOWER[inside], UPPER[inside])
-    scores, curvature = _slopes(model, found, scaled)
-    parts = _neighbours(model.mueller(found).reshape(-1, 16))
-    seen = np.einsum("nki,ni->nk", parts, data)
-    noise = np.einsum("nki,nij,nlj->nkl", parts, covariance, parts, optimize=True)
-    square = np.einsum("nk,nk->n", seen, np.linalg.solve(noise, seen[..., None])[..., 0])
-    return _result(found, -curvature.sum(axis=0), scores, float(square.sum()), 6 * len(data) - 4, "dominant process")
+    return found
+
+
+def _unexplained(residual: Array, changes: Sequence[Array]) -> float:
+    """Sum of squares of a residual in units of the noise, where each of `changes` may be in it, of unit variance."""
+    square = float(np.sum(residual**2))
+    if not changes:
+        return square
+    flat = np.array([change.reshape(-1) for change in changes])
+    along = flat @ residual.reshape(-1)
+    return square - float(along @ np.linalg.solve(np.eye(len(flat)) + flat @ flat.T, along))
 
 
 def _slopes(model: _Forward, q: Array, scaled: Array) -> tuple[Array, Array]:
@@ -235,47 +263,64 @@ def _departures(m0: Array) -> Array:
     return np.asarray(DEPARTURE * np.sqrt(3 / 8) * np.sqrt(2) * np.stack(parts))
 
 
-def _fit_correlation(model: _Forward, data: Array, rows: Array) -> MaterialFit:
-    """Fit data (N, K) in units of the noise; rows (N, K, 16) lead from the Mueller matrix to them."""
-    # What the ideal depolarizer explains is projected out of the data and of the model.
-    flat = rows[:, :, 0] / np.linalg.norm(rows[:, :, 0], axis=1, keepdims=True)
-    light = np.sum(flat * data, axis=1) / np.linalg.norm(rows[:, :, 0], axis=1)
+@dataclass(frozen=True)
+class _Correlation:
+    """Data (N, K) in units of the noise and rows (N, K, 16) that lead from the Mueller matrix to them.
 
-    def polarized(values: Array) -> Array:
-        return np.asarray(values - flat * np.sum(flat * values, axis=1, keepdims=True))
+    What the ideal depolarizer explains is projected out of the data and of the model.
+    """
 
-    data = polarized(data)
+    model: _Forward
+    rows: Array
+    flat: Array
+    light: Array
+    data: Array
 
-    def parts(q: Array) -> tuple[Array, Array]:
-        modelled = polarized(np.einsum("nki,ni->nk", rows, model.mueller(q).reshape(-1, 16)))
-        return modelled, np.sum(modelled * data, axis=1, keepdims=True)
+    @classmethod
+    def of(cls, model: _Forward, values: Array, rows: Array, whiten: Array) -> _Correlation:
+        rows, data = whiten @ rows, np.einsum("nij,jn->ni", whiten, values)
+        size = np.linalg.norm(rows[:, :, 0], axis=1, keepdims=True)
+        flat = rows[:, :, 0] / size
+        light = np.sum(flat * data, axis=1) / size[:, 0]
+        return cls(model, rows, flat, light, data - flat * np.sum(flat * data, axis=1, keepdims=True))
 
-    def residual(q: Array) -> Array:
-        modelled, overlap = parts(q)
+    def polarized(self, values: Array) -> Array:
+        return np.asarray(values - self.flat * np.sum(self.flat * values, axis=1, keepdims=True))
+
+    def parts(self, q: Array) -> tuple[Array, Array]:
+        modelled = self.polarized(np.einsum("nki,ni->nk", self.rows, self.model.mueller(q).reshape(-1, 16)))
+        return modelled, np.sum(modelled * self.data, axis=1, keepdims=True)
+
+    def residual(self, q: Array) -> Array:
+        modelled, overlap = self.parts(q)
         size = np.maximum(np.sum(modelled**2, axis=1, keepdims=True), 1e-300)
-        return np.asarray(data - modelled * np.maximum(overlap, 0) / size)
+        return np.asarray(self.data - modelled * np.maximum(overlap, 0) / size)
 
-    found, jacobian = _search(residual)
-    left = residual(found)
-    modelled, overlap = parts(found)
+
+def _fit_correlation(own: _Correlation, moved: Sequence[_Correlation]) -> MaterialFit:
+    """Fit by linear correlation; `moved` are the same data by an instrument that is off."""
+    found, jacobian = _search(own.residual, STARTS)
+    off = np.array([_search(other.residual, (found,))[0] - found for other in moved]).reshape(-1, 4)
+    left = own.residual(found)
+    changes = [other.residual(found) - left for other in moved]
+    modelled, overlap = own.parts(found)
     with np.errstate(invalid="ignore", divide="ignore"):
-        rho = overlap[:, 0] / (np.linalg.norm(modelled, axis=1) * np.linalg.norm(data, axis=1))
+        rho = overlap[:, 0] / (np.linalg.norm(modelled, axis=1) * np.linalg.norm(own.data, axis=1))
     slopes = jacobian.reshape(*left.shape, 4)
     unit = modelled / np.maximum(np.linalg.norm(modelled, axis=1, keepdims=True), 1e-300)
-    moved, unlike = [], 0.0
-    for change in _departures(model.mueller(found).reshape(-1, 16)):
-        extra = polarized(light[:, None] * np.einsum("nki,ni->nk", rows, change))
+    departures, unlike = [], 0.0
+    for change in _departures(own.model.mueller(found).reshape(-1, 16)):
+        extra = own.polarized(own.light[:, None] * np.einsum("nki,ni->nk", own.rows, change))
         extra -= unit * np.sum(unit * extra, axis=1, keepdims=True)
-        moved.append(np.einsum("nkp,nk->p", slopes, extra))
+        departures.append(np.einsum("nkp,nk->p", slopes, extra))
         unlike += float(np.sum(extra**2))
-    square, free = float(np.sum(left**2)), left.size - 2 * len(left) - 4
+    square, free = _unexplained(left, changes), left.size - 2 * len(left) - 4
     # Eigenvalues may differ by more than usual: by as much as makes the residual.
     more = max(1.0, float(np.sqrt(max(square - free, 0) / unlike)))
-    scores = np.einsum("nkp,nk->np", slopes, left)
-    result = _result(
-        found, jacobian.T @ jacobian, scores, square, free, "linear correlation", departures=more * np.array(moved)
-    )
-    share = float(np.sqrt(square / np.sum(data**2)))
+    scores, curvature = np.einsum("nkp,nk->np", slopes, left), jacobian.T @ jacobian
+    method, apart = "linear correlation", more * np.array(departures)
+    result = _result(found, curvature, scores, square, free, method, off, departures=apart)
+    share = float(np.sqrt(np.sum(left**2) / np.sum(own.data**2)))
     return replace(result, residual=share, correlation=float(np.nanmean(rho)))
 
 
@@ -301,7 +346,7 @@ def _some(good: NDArray[np.bool_], limit: int) -> NDArray[np.int64]:
     return index[np.linspace(0, index.size - 1, min(index.size, limit)).astype(np.int64)]
 
 
-def _search(residual: Callable[[Array], Array]) -> tuple[Array, Array]:
+def _search(residual: Callable[[Array], Array], starts: Sequence[Array | tuple[float, ...]]) -> tuple[Array, Array]:
     # Every module of this folder is imported when a material file is read, the optimizer only where it is needed.
     from scipy.optimize import least_squares
 
@@ -309,7 +354,7 @@ def _search(residual: Callable[[Array], Array]) -> tuple[Array, Array]:
         return residual(p).reshape(-1)
 
     best = None
-    for start in STARTS:
+    for start in starts:
         fit = least_squares(flat, start, bounds=(LOWER, UPPER), x_scale=[0.1, 0.1, 0.1, 1.0], max_nfev=60)
         if best is None or fit.cost < best.cost * (1 - 1e-9):
             best = fit
@@ -325,12 +370,13 @@ def _result(
     square: float,
     free: int,
     method: str,
+    off: Array,
     departures: Array | None = None,
 ) -> MaterialFit:
     """A fit from the curvature (4, 4) of its sum and the slopes (N, 4) of the pixels.
 
-    `square`, of `free` numbers, is what it does not describe in units of the noise; `departures` (D, 4) are slopes by
-    what the model leaves out.
+    `square`, of `free` numbers, is what it does not describe in units of the noise; `off` (D, 4) is what each
+    uncertain input of the instrument does to the constants, `departures` are slopes by what the model leaves out.
     """
     from scipy.special import chdtrc
 
@@ -352,7 +398,8 @@ def _result(
         covariance[np.ix_(inside, inside)] = whole[np.ix_(inside, inside)]
         if departures is not None:
             departure = bread @ departures.T @ departures @ bread
-    stderr = np.sqrt(np.diag(covariance + departure))
+    systematic = off.T @ off
+    stderr = np.sqrt(np.diag(covariance + departure + systematic))
     limit = RELATIVE_LIMIT * np.abs(found)
     limit[1] = max(limit[1], K_LIMIT)
     # k and a may well be 0; an n at the end of its range is no surface, and what was fitted beside it means nothing.
@@ -361,6 +408,7 @@ def _result(
         constants=found,
         covariance=covariance,
         departure=departure,
+        systematic=systematic,
         identified=identified,
         condition=condition,
         residual=np.nan,

@@ -12,6 +12,7 @@ from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.instrument.uncertainty import value_directions
 from processing.maps.extrapolation import extrapolate_mueller
+from processing.maps.material_fit import fit_products
 from processing.maps.quantities import quantities_of_mueller
 from processing.maps.tables import tabulate
 from processing.maps.xi0 import dominant_model, xi0_of_mueller
@@ -22,6 +23,7 @@ from processing.reflectance.tables import ScatteringTable
 from processing.storage.captures.capture import Capture
 from processing.storage.products.product import Product, Step
 from processing.yaml_file import ConfigError, parse_yaml
+from simulators.bench.scene import Scene
 
 STEP = Step("test", {})
 ANGLES = dict(rotating_retarders(1.0, 40, 9.0, 4.91).angles_deg)
@@ -196,6 +198,51 @@ def test_a_mueller_table_covers_an_instrument_that_is_off_and_its_noise(stated, 
     pulls = [(r.mean - exact.mean) / r.uncertainties["u_noise"] for r in repeats]
     # 24 repeats of some 100 bins in each element.
     assert np.sqrt(np.mean(np.square(pulls), axis=(0, 2))) == pytest.approx(np.ones(16), abs=0.1)
+
+
+def sphere_capture(synthetic_capture, configs, truth, name, **kind):
+    """The red sphere without noise, as an instrument measures it: its captures differ by the instrument alone."""
+    scene = Scene.load(configs / "scenes/red_sphere.yaml")
+    m = np.nan_to_num(scene.mueller_image(35.0, 662, 48, 48)).reshape(48, 48, 16).astype(float)
+    angles = {} if truth.mosaic else ANGLES
+    light = COUNTS * np.einsum("scm,xym->scxy", truth.rows(angles or {"": np.zeros(1)}), m)
+    if truth.mosaic:
+        frames = np.zeros((1, 1, 48, 48))
+        index = [channel.name for channel in truth.channels]
+        for (r, c), channel in np.ndenumerate(np.array(truth.mosaic)):
+            frames[0, 0, r::2, c::2] = light[0, index.index(channel), r::2, c::2]
+        light, kind = frames, kind | {"mosaic": truth.mosaic}
+    detector = {"gain_e_per_count": 1.0, "read_noise_e": 1.0, "black_level_counts": 0.0}
+    return synthetic_capture(light.astype(np.float32), angles, name=name, detector=detector, omega_deg=35.0, **kind)
+
+
+@pytest.mark.parametrize("kind", ["mueller", "correlation", "stokes"])
+def test_the_instruments_uncertainty_reaches_fitted_constants(stated, synthetic_capture, configs, tmp_path, kind):
+    """A value that is off by u moves n and k by what the fit says of it; the chi-square does not blame the model."""
+    name, u = ("analyzer.azimuth_deg", 0.2) if kind == "stokes" else ("psa_retarder.azimuth_deg", 0.1)
+    model = InstrumentModel.load(
+        configs / "instruments" / ("linear_stokes.yaml" if kind == "stokes" else "rgb950.yaml")
+    )
+    model = model.at(662)
+    if kind == "stokes":
+        name = "micropolarizer_45.azimuth_deg"
+    element, _, field = name.rpartition(".")
+    off = model.with_values({element: {field: model.value_of(name) + u}})
+    path = sphere_capture(synthetic_capture, configs, off, "s.h5")
+    fits = []
+    for used in (off, model.model_copy(update={"stderr": {name: u}})):
+        product = tmp_path / f"{len(fits)}.h5"
+        with Capture(path) as capture:
+            (reduce_stokes if kind == "stokes" else reduce_mueller)(capture, used, product, (STEP,))
+        geometry = configs / "geometries/one_inch_sphere.yaml"
+        fits.append(fit_products([product], geometry, correlation=kind == "correlation")[0])
+    exact, nominal = fits
+    moved, told = nominal.constants - exact.constants, np.sqrt(np.diag(nominal.systematic))
+    assert np.abs(moved[0]) > 1e-4
+    assert not exact.systematic.any()
+    assert told == pytest.approx(np.abs(moved), rel=0.15, abs=2e-4)
+    assert nominal.chi_square < 1.1 * exact.chi_square + 0.05
+    assert any("the instrument's uncertainty: n" in note for note in nominal.notes(["a"]))
 
 
 def test_compared_tables_share_the_error_of_one_instrument(configs):
