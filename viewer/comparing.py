@@ -11,7 +11,6 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 
 from processing.errors import ProcessError
-from processing.polarization import gradients
 from processing.polarization.propagation import Derived
 from processing.reduction.noise import NoiseModel
 from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
@@ -22,17 +21,10 @@ from processing.storage.products.provenance import content_of
 from viewer.frames import chosen
 from viewer.pages import file_of, pages_of
 from viewer.planes import Window, sent
-from viewer.products import MATRICES, maps_of, named, read_map, units_words
+from viewer.products import DERIVED, choices_of, is_whole, named, read_map, units_words
 
 #: Errors at the ends of the scale of a difference over its error.
 ERRORS_SHOWN = 5.0
-
-#: Quantities of M that two Mueller products are compared in, with the noise that they share.
-DERIVED = {
-    "depolarization_index": gradients.depolarization_index,
-    "diattenuation_linear": gradients.diattenuation,
-    "polarizance_linear": gradients.polarizance,
-}
 
 #: Values and their standard errors, each (rows, columns).
 Measured = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -63,31 +55,29 @@ def _choices(a: Path, b: Path) -> tuple[list[dict[str, Any]], tuple[int, int]]:
             _same_shape(one.frame_shape, other.frame_shape)
             count = min(len(one.done), len(other.done))
             roles = one.role[:count]
-            choices = [{"label": f"state {one.done[k]}, {roles[k]}", "state": k} for k in range(count)]
+            choices = states_to_choose(one)[:count]
             return sorted(choices, key=lambda c: roles[c["state"]] == "dark"), one.frame_shape
     with Product(a) as first, Product(b) as second:
         _same_shape(first.shape, second.shape)
-        there = {(m["name"], m["index"]) for m in maps_of(second)}
-        maps = [m for m in maps_of(first) if (m["name"], m["index"]) in there]
-        if first.kind in MATRICES and second.kind in MATRICES:
-            elements = [{"label": f"m{k // 4}{k % 4} over m00", "name": "mueller", "index": k} for k in range(1, 16)]
-            maps = [*elements, {"label": "m00", "name": "mueller", "index": 0}, *maps]
-        if _is_whole(first) and _is_whole(second):
-            maps += [{"label": name.replace("_", " "), "name": name, "index": 0} for name in DERIVED]
-        return maps, first.shape
+        there = {(c["name"], c["index"]) for c in choices_of(second)}
+        return [c for c in choices_of(first) if (c["name"], c["index"]) in there], first.shape
 
 
-def _is_whole(product: Product) -> bool:
-    return product.kind == "mueller" and int(product.facts.get("rank", 16)) == 16
+def states_to_choose(capture: Capture) -> list[dict[str, Any]]:
+    """The states done of a capture, as `chosen` reads them."""
+    return [
+        {"label": f"state {number}, {role}", "state": k}
+        for k, (number, role) in enumerate(zip(capture.done, capture.role, strict=True))
+    ]
 
 
-def _asked(product: Product, query: Any) -> tuple[str, int]:
+def asked_of(product: Product, query: Any) -> tuple[str, int]:
     """Dataset or derived quantity, and the number of it."""
     return (query["name"], 0) if _is_derived(product, query) else named(product, query)
 
 
 def _is_derived(product: Product, query: Any) -> bool:
-    return _is_whole(product) and query.get("name") in DERIVED
+    return is_whole(product) and query.get("name") in DERIVED
 
 
 def _same_shape(a: tuple[int, int], b: tuple[int, int]) -> None:
@@ -102,9 +92,9 @@ def difference(request: Request) -> Response:
         with Product(a) as first, Product(b) as second:
             _same_shape(first.shape, second.shape)
             window = Window.asked(query, first.shape, most=640)
-            one, other = (_of_product(product, query, window) for product in (first, second))
+            one, other = (product_values(product, query, window) for product in (first, second))
             shared = _shared_errors(first, second, query, window)
-            name, index = _asked(first, query)
+            name, index = asked_of(first, query)
             units = "" if name == "mueller" or name in DERIVED else first.units(name)
             scale = scale_of("m00" if name == "mueller" and index == 0 else name, units, one[0])
     else:
@@ -112,7 +102,7 @@ def difference(request: Request) -> Response:
         with Capture(a) as early, Capture(b) as late:
             _same_shape(early.frame_shape, late.frame_shape)
             window = Window.asked(query, early.frame_shape, most=640)
-            one, other = (_of_capture(capture, query, window) for capture in (early, late))
+            one, other = (capture_values(capture, query, window) for capture in (early, late))
             name, units, scale = None, "counts", Scale(LIGHT, *_ends(one[0]))
     apart = one[0] - other[0]
     if (period := None if name is None else period_deg(name, units)) is not None:
@@ -137,8 +127,9 @@ def _ends(counts: NDArray[np.float32]) -> tuple[float, float]:
     return low, max(high, low + 1)
 
 
-def _of_product(product: Product, query: Any, window: Window) -> Measured:
-    name, index = _asked(product, query)
+def product_values(product: Product, query: Any, window: Window) -> Measured:
+    """What a request chooses of a product in a window, with its standard errors, NaN where they are not known."""
+    name, index = asked_of(product, query)
     if _is_derived(product, query):
         image = _image(product, window)
         values, gradient, *_ = _derived(image, name)
@@ -168,7 +159,7 @@ def _shared_errors(first: Product, second: Product, query: Any, window: Window) 
     captures = [[content_of(i) for i in every if i.get("role") == "capture"] for every in inputs]
     if captures[0] != captures[1] or not any(captures[0]):
         return None
-    name, index = _asked(first, query)
+    name, index = asked_of(first, query)
     if not (name == "mueller" or _is_derived(first, query)) or not first.kind == second.kind == "mueller":
         return np.full(window.shape, np.nan)
     images = [_image(product, window) for product in (first, second)]
@@ -187,7 +178,8 @@ def _derived(image: MuellerImage, name: str) -> Derived:
     return DERIVED[name](image.matrices.astype(float))[name]
 
 
-def _of_capture(capture: Capture, query: Any, window: Window) -> Measured:
+def capture_values(capture: Capture, query: Any, window: Window) -> Measured:
+    """Counts of the state that a request chooses in a window, with the noise of light and camera."""
     state, channel = chosen(capture, query)
     counts = window.mean(capture.frames(state, window.rows)[channel])
     detector = capture.header.detector

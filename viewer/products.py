@@ -11,6 +11,7 @@ from starlette.responses import HTMLResponse, Response
 
 from processing.errors import ProcessError
 from processing.maps.stokes_vector import is_stokes_vector
+from processing.polarization import gradients
 from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
 from processing.reports.fact_words import fact_words
 from processing.storage.products.product import COMPANIONS, LIT_ERRORS, Product
@@ -22,6 +23,13 @@ from viewer.planes import Window, sent
 
 #: Kinds that hold Mueller matrices.
 MATRICES = ("mueller", "extrapolated")
+#: Quantities of M of a product that holds M alone.
+DERIVED = {
+    "depolarization_index": gradients.depolarization_index,
+    "diattenuation_linear": gradients.diattenuation,
+    "polarizance_linear": gradients.polarizance,
+}
+
 #: The map that a page opens on; default: that with the name of the kind.
 FIRST = {"stokes": "s0", "quantities": "depolarization_index"}
 
@@ -32,7 +40,7 @@ def product(request: Request) -> HTMLResponse:
     library = pages.library
     entry, entries = library.entry(library.name(path)), library.entries()
     with Product(path) as opened:
-        maps = maps_of(opened)
+        maps, choices = maps_of(opened), choices_of(opened)
         facts = [(name.replace("_", " "), fact_words(v)) for name, v in opened.facts.items() if name != "warnings"]
         provenance = steps_text(opened.steps)
         shape, kind = opened.shape, opened.kind
@@ -44,7 +52,8 @@ def product(request: Request) -> HTMLResponse:
         kind=kind,
         facts=facts,
         provenance=provenance,
-        look={"maps": maps, "shape": shape, "matrices": matrices},
+        look={"maps": maps, "shape": shape, "matrices": matrices, "choices": choices},
+        choices=choices,
         colours={name: steps(name) for name in ALL},
         sources=[
             (role, path, e, pages.shown_at(e) if e else None)
@@ -75,6 +84,29 @@ def maps_of(opened: Product) -> list[dict[str, Any]]:
             words = name.replace("_", " ")
             found += [common | {"index": k, "label": words if count == 1 else f"{words} {k}"} for k in range(count)]
     return found
+
+
+def choices_of(product: Product) -> list[dict[str, Any]]:
+    """What a product can be asked for: elements over m00, its maps, quantities of a whole M."""
+    found = maps_of(product)
+    if is_stokes_vector(product):
+        elements = [{"label": f"S{k} over S0", "name": "mueller", "index": 4 * k} for k in range(1, 4)]
+        found = [
+            *elements,
+            {"label": "S0", "name": "mueller", "index": 0},
+            *(m for m in found if m["name"] != "mueller"),
+        ]
+    elif product.kind in MATRICES:
+        elements = [{"label": f"m{k // 4}{k % 4} over m00", "name": "mueller", "index": k} for k in range(1, 16)]
+        found = [*elements, {"label": "m00", "name": "mueller", "index": 0}, *found]
+    if is_whole(product):
+        found += [{"label": name.replace("_", " "), "name": name, "index": 0} for name in DERIVED]
+    return found
+
+
+def is_whole(product: Product) -> bool:
+    """Whether a product determines every element of M."""
+    return product.kind == "mueller" and int(product.facts.get("rank", 16)) == 16
 
 
 def plane(request: Request) -> Response:

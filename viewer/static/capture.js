@@ -4,6 +4,7 @@ import "./start.js";
 import { drawsRegions, ImageView, place, readPlane, saturated } from "./images.js";
 import { accent, at, bad, byId, draw, embedded, getJson, ink, narrow, newestJson, pressed, say } from "./plots.js";
 import { drawCurve, showProbe } from "./probe.js";
+import { Regions } from "./regions.js";
 
 const file = byId("look").dataset.file;
 const slider = byId("state"), channel = byId("channel"), problem = byId("problem");
@@ -25,10 +26,12 @@ const view = new ImageView(byId("frame"), {
   chosen: region => probe(region),
 });
 
+const regions = new Regions(file, () => view, () => ({ state: slider.value, channel: channel.value || 0 }));
 const curveOf = newestJson(), matrixOf = newestJson();
 const run = action => action().then(() => problem.replaceChildren(), error => say(problem, error));
 
 async function probe(region) {
+  regions.show();
   await run(async () => {
     const found = await curveOf("curve", { file, ...region, channel: channel.value || 0 });
     if (!found) return;
@@ -82,7 +85,7 @@ async function show() {
 // The picture comes first; while the slider is drawn along, only the last histogram is worth drawing.
 function histogramSoon() {
   clearTimeout(histogramSoon.pause);
-  histogramSoon.pause = setTimeout(() => run(drawHistogram), 60);
+  histogramSoon.pause = setTimeout(() => run(() => Promise.all([drawHistogram(), regions.show()])), 60);
 }
 
 function play(on) {

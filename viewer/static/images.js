@@ -49,7 +49,7 @@ export function drawsRegions(button, node) {
  */
 export class ImageView {
   constructor(node, { read, traces, shape, more = () => ({}), chosen }) {
-    Object.assign(this, { node, read, traces, shape, more, chosen, plane: null, region: null, axes: [["x", "y"]] });
+    Object.assign(this, { node, read, traces, shape, more, chosen, plane: null, region: null, named: [], axes: [["x", "y"]] });
     node.dataset.wheel = "yes";
   }
 
@@ -105,10 +105,17 @@ export class ImageView {
   }
 
   marks() {
-    if (!this.region) return [];
-    const { x0, x1, y0, y1 } = this.region;
-    const line = { color: "#ff2d95", width: 2 };
-    return this.axes.map(([xref, yref]) => ({ type: "rect", xref, yref, x0: x0 - 0.5, x1: x1 - 0.5, y0: y0 - 0.5, y1: y1 - 0.5, line }));
+    const box = ({ x0, x1, y0, y1 }) => ({ type: "rect", x0: x0 - 0.5, x1: x1 - 0.5, y0: y0 - 0.5, y1: y1 - 0.5 });
+    const marks = this.named.map(one => ({
+      ...box(one), line: { color: "#ff2d95", width: 1, dash: "dot" }, label: { text: one.name, textposition: "top left", font: { color: "#ff2d95", size: 11 } },
+    }));
+    if (this.region) marks.push({ ...box(this.region), line: { color: "#ff2d95", width: 2 } });
+    return this.axes.flatMap(([xref, yref]) => marks.map(mark => ({ ...mark, xref, yref })));
+  }
+
+  /** Draw the marks again. */
+  mark() {
+    if (this.node.layout) Plotly.relayout(this.node, { shapes: this.frame().shapes });
   }
 
   listen() {
@@ -136,7 +143,7 @@ export class ImageView {
     x0 = inside(x0, 0, this.shape[1] - 1); x1 = inside(x1, x0 + 1, this.shape[1]);
     y0 = inside(y0, 0, this.shape[0] - 1); y1 = inside(y1, y0 + 1, this.shape[0]);
     this.region = { x0, x1, y0, y1 };
-    if (this.node.layout) Plotly.relayout(this.node, { shapes: this.frame().shapes });
+    this.mark();
     if (told) this.chosen?.(this.region);
   }
 

@@ -101,6 +101,19 @@ export const statusColour = status => ({
   done: "#2e7d4f", flagged: "#e0a030", partial: "#e0a030", failed: "#b3261e", running: accent(),
 })[status] || quiet();
 
+/** A value with its errors: each with two digits, the value as far as the smallest of them reaches. */
+export function measured(value, errors) {
+  const known = errors.filter(e => e !== null && e !== undefined && e > 0 && Number.isFinite(e)).map(e => Number(e.toPrecision(2)));
+  const least = known.length ? Math.floor(Math.log10(Math.min(...known))) - 1 : null;
+  const shown = v => {
+    if (v === null || v === undefined) return "?";
+    if (v === 0 || least === null) return String(Number(v.toPrecision(6)));
+    if (least > 0) return String(Math.round(v / 10 ** least) * 10 ** least);
+    return least < -12 ? v.toPrecision(6) : v.toFixed(-least);
+  };
+  return value === null || value === undefined ? "-" : [value, ...errors].map(shown).join(" ± ");
+}
+
 export function duration(seconds) {
   if (seconds === null || seconds === undefined) return "not known yet";
   if (seconds < 90) return `${Math.round(seconds)} s`;

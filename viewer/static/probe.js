@@ -1,6 +1,6 @@
 // What is known of a pixel: its intensities with the fitted curve, its Mueller matrix, where it lies in the simplex.
 
-import { accent, draw, ink, quiet, warn } from "./plots.js";
+import { accent, draw, ink, measured, quiet, warn } from "./plots.js";
 
 const SYMBOLS = ["circle", "square", "diamond", "cross"];
 
@@ -42,7 +42,6 @@ export function drawCurve(node, found, now = null) {
 const number = (v, digits = 4) => v === null || v === undefined ? "-" : Math.abs(v) >= 1e4 ? v.toExponential(2) : v.toFixed(digits);
 // Noise may make anything of a value without an error bar: it must not look certain.
 const UNKNOWN = "± ?: too near to the noise, or to a place where its error bar would not hold.";
-const pm = (v, e, digits = 4) => v === null || v === undefined ? "-" : `${number(v, digits)} ± ${e === null || e === undefined ? "?" : number(e, digits)}`;
 const cell = (text, tag = "td") => { const node = document.createElement(tag); node.textContent = text; return node; };
 const row = (...cells) => { const node = document.createElement("tr"); node.append(...cells); return node; };
 const heading = text => cell(text, "h3");
@@ -53,9 +52,9 @@ function muellerTable(matrix) {
   table.className = "matrix";
   matrix.mueller.forEach((line, i) => {
     const cells = line.map((v, j) => {
-      const node = cell(i || j ? number(v) : "1");
-      const error = v === null ? "not seen" : `± ${number(matrix.mueller_errors[i][j])}`;
-      const small = cell(i || j ? error : `m00 = ${number(matrix.m00, 1)}`, "small");
+      const [shown, error] = v === null ? ["-", "not seen"] : measured(v, [matrix.mueller_errors[i][j]]).split(" ± ");
+      const node = cell(i || j ? shown : "1");
+      const small = cell(i || j ? (v === null ? error : `± ${error}`) : `m00 = ${measured(matrix.m00, [matrix.m00_error])}`, "small");
       node.append(small);
       return node;
     });
@@ -65,21 +64,21 @@ function muellerTable(matrix) {
 }
 
 const NAMES = {
-  coherency_eigenvalues: ["coherency eigenvalues ξ0 ... ξ3", 4], td_missed: ["light that the triply degenerate model misses", 4], entropy: ["entropy", 4],
-  depolarization_index: ["depolarization index", 4], diattenuation: ["diattenuation", 4],
-  diattenuation_orientation_deg: ["its orientation / degrees", 2], polarizance: ["polarizance", 4],
-  polarizance_orientation_deg: ["its orientation / degrees", 2], dominant_diattenuation_linear: ["linear diattenuation of the dominant process", 4],
-  dominant_diattenuation_orientation_deg: ["its orientation / degrees", 2],
-  retardance_deg: ["retardance (Lu-Chipman) / degrees", 2], retardance_fast_axis_deg: ["its fast axis / degrees", 2], depolarization_power: ["depolarization power (Lu-Chipman)", 4],
+  coherency_eigenvalues: "coherency eigenvalues ξ0 ... ξ3", td_missed: "light that the triply degenerate model misses", entropy: "entropy",
+  depolarization_index: "depolarization index", diattenuation: "diattenuation",
+  diattenuation_orientation_deg: "its orientation / degrees", polarizance: "polarizance",
+  polarizance_orientation_deg: "its orientation / degrees", dominant_diattenuation_linear: "linear diattenuation of the dominant process",
+  dominant_diattenuation_orientation_deg: "its orientation / degrees",
+  retardance_deg: "retardance (Lu-Chipman) / degrees", retardance_fast_axis_deg: "its fast axis / degrees", depolarization_power: "depolarization power (Lu-Chipman)",
 };
 
 function quantityTable(quantities) {
   const table = document.createElement("table");
   table.className = "facts";
-  for (const [name, [label, digits]] of Object.entries(NAMES)) {
+  for (const [name, label] of Object.entries(NAMES)) {
     const found = quantities[name];
     if (!found) continue;
-    const text = found.value.map((v, k) => pm(v, found.error[k], digits)).join(", ");
+    const text = found.value.map((v, k) => measured(v, [found.error[k]])).join(", ");
     table.append(row(cell(label, "th"), cell(text)));
   }
   return table;
@@ -111,7 +110,7 @@ function showStokes(node, found) {
   const table = document.createElement("table");
   table.className = "facts";
   for (const [name, { value, error }] of Object.entries(found.fit.stokes)) {
-    table.append(row(cell(name, "th"), cell(pm(value, error, name === "S0" ? 1 : name.startsWith("AoLP") ? 2 : 4))));
+    table.append(row(cell(name, "th"), cell(measured(value, [error]))));
   }
   node.replaceChildren(cell(`At ${found.where}`, "h2"), heading("Stokes vector of the super-pixels, with standard errors"), table, cell(chiSquare(found.fit), "p"));
 }

@@ -3,8 +3,9 @@
 import "./start.js";
 import { drawsRegions } from "./images.js";
 import { mapView, matrixView } from "./maps.js";
-import { byId, embedded, newestJson, say } from "./plots.js";
+import { byId, embedded, measured, newestJson, say } from "./plots.js";
 import { drawCurve, showProbe } from "./probe.js";
+import { Regions } from "./regions.js";
 
 const file = byId("look").dataset.file, spec = embedded("spec"), problem = byId("problem");
 const map = byId("map"), errors = byId("errors"), normalized = byId("normalized");
@@ -16,6 +17,7 @@ const run = action => action().then(() => problem.replaceChildren(), error => sa
 const flag = box => (box.checked ? "1" : null);
 const node = byId("plot");
 let view = null, region = null;
+const regions = new Regions(file, () => view, () => { const { name, index } = spec.choices[Number(byId("of").value)]; return { name, index }; });
 
 function newView() {
   Plotly.purge(node);
@@ -35,18 +37,20 @@ async function show(fresh) {
   if (errors.disabled) errors.checked = false;
   byId("about").textContent = m ? m.about : normalized.checked
     ? "Elements over m00 on one scale, instrument frames; the first panel is m00 in counts. Grey: too dark, or not determined." : "Elements in counts on one scale, instrument frames.";
-  if (fresh) { view = newView(); view.region = region; }
+  if (fresh) { view = newView(); view.region = region; view.named = regions.named; }
   await run(() => view.refresh());
 }
 
-const number = v => (v === null ? "-" : Number.isInteger(v) ? String(v) : Math.abs(v) >= 1e4 || Math.abs(v) < 1e-3 ? v.toExponential(3) : v.toFixed(4));
 // Without an error bar, where others of its kind have one, a value may be noise: it must not look certain.
 // Noise averages over a region; what the instrument's uncertainty does is the same in all of it.
-const withError = (v, plane, k) => number(v) + [["error", ""], ["systematic", " (instrument)"]].map(([part, told]) =>
-  !plane[part] || v === null ? "" : ` ± ${plane[part][k] === null ? "?" : number(plane[part][k])}${told}`).join("");
+const withError = (v, plane, k) => {
+  const parts = ["error", "systematic"].filter(part => plane[part]);
+  return measured(v, parts.map(part => plane[part][k])) + (parts.includes("systematic") && v !== null ? " (instrument)" : "");
+};
 
 async function probe(chosen) {
   region = chosen;
+  regions.show();
   await run(async () => {
     const found = await probeOf("probe", { file, ...chosen });
     if (!found) return;
@@ -69,6 +73,7 @@ async function probe(chosen) {
 }
 
 map.addEventListener("change", () => show(true));
+byId("of").addEventListener("change", () => regions.show());
 errors.addEventListener("change", () => show(false));
 normalized.addEventListener("change", () => show(false));
 drawsRegions(byId("region"), node);
@@ -76,6 +81,7 @@ node.addEventListener("keydown", event => view.key(event));
 
 addEventListener("load", async () => {
   await show(true);
+  regions.show();
   const wanted = new URLSearchParams(location.hash.slice(1));
   if (wanted.has("x")) view.choose({ x0: Number(wanted.get("x")), y0: Number(wanted.get("y")) });
   document.body.dataset.ready = "yes";
