@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 from urllib.parse import urlencode
 
@@ -16,6 +19,7 @@ from processing.commands.batch import natural
 from viewer.campaigns import STATUS, CampaignView, read_campaign
 from viewer.jobs import Jobs
 from viewer.library import Entry, Library, NotHere, made_from
+from viewer.notes import Note, notes_of
 from viewer.pages import file_of, pages_of
 from viewer.starting import campaign_files, resumed_with
 
@@ -24,7 +28,7 @@ MOST = 50
 #: What a list can be sorted by, as its columns are called; a minus turns the order round.
 SORTS: dict[str, Callable[[Entry], Any]] = {
     "name": lambda e: natural(Path(e.name)),
-    "sample": lambda e: "" if e.header is None else e.header.sample.name or e.header.sample.kind,
+    "sample": lambda e: e.sample,
     "nm": lambda e: 0.0 if e.header is None else e.header.wavelength_nm,
     "omega": lambda e: -1.0 if e.header is None or e.header.omega_deg is None else e.header.omega_deg,
     "mode": lambda e: "" if e.header is None else e.header.mode,
@@ -38,7 +42,12 @@ SORTS: dict[str, Callable[[Entry], Any]] = {
 
 @dataclass(frozen=True)
 class Listed:
-    """One page of a list: its files, the address of any other page, and of the list in another order."""
+    """One page of a list: its files, the address of any other page, and of the list in another order.
+
+    Attributes
+    ----------
+    groups : of each file its group, and how many files the list has of it; none where it is not grouped.
+    """
 
     entries: list[Entry]
     page: int
@@ -48,18 +57,39 @@ class Listed:
     sort: str
     query: dict[str, str]
     root: str
+    group: str = ""
+    groups: tuple[tuple[str, int], ...] = ()
 
     @classmethod
-    def of(cls, entries: list[Entry], key: str, request: Request, root: str) -> Listed:
-        """The page that a request asks for with `<key>_page` and `<key>_sort`; the newest files first by default."""
+    def of(
+        cls,
+        entries: list[Entry],
+        key: str,
+        request: Request,
+        groups: Mapping[str, Callable[[Entry], str]] = MappingProxyType({}),
+    ) -> Listed:
+        """The page that a request asks for with `<key>_page`, `<key>_sort` and `<key>_group`; newest files first.
+
+        Parameters
+        ----------
+        groups : what the list can be grouped by, and the group of a file; empty where it is in none.
+        """
         query = dict(request.query_params)
-        sort = query.get(f"{key}_sort", "")
+        sort, group = query.get(f"{key}_sort", ""), query.get(f"{key}_group", "")
         if sort.removeprefix("-") in SORTS:
             entries = sorted(entries, key=SORTS[sort.removeprefix("-")], reverse=sort.startswith("-"))
+        counts: Counter[str] = Counter()
+        if group in groups:
+            # The sort is stable: inside a group the order stays.
+            entries = sorted(entries, key=lambda e: ((name := groups[group](e)) == "", natural(Path(name))))
+            counts.update(map(groups[group], entries))
         pages = max(1, -(-len(entries) // MOST))
         asked = query.get(f"{key}_page", "1")
         page = min(max(int(asked) if asked.isdecimal() else 1, 1), pages)
-        return cls(entries[(page - 1) * MOST : page * MOST], page, pages, len(entries), key, sort, query, root)
+        shown = entries[(page - 1) * MOST : page * MOST]
+        of_shown = tuple((name, counts[name]) for e in shown if counts for name in [groups[group](e)])
+        root = pages_of(request).root
+        return cls(shown, page, pages, len(entries), key, sort, query, root, group if counts else "", of_shown)
 
     def at(self, page: int) -> str:
         """Address of a page of the list."""
@@ -70,12 +100,22 @@ class Listed:
         order = f"-{column}" if self.sort == column else column
         return self._address({f"{self.key}_sort": order, f"{self.key}_page": "1"})
 
+    def grouped(self, by: str) -> str:
+        """Address of the list grouped by a campaign or a sample, or not grouped."""
+        return self._address({f"{self.key}_group": by, f"{self.key}_page": "1"})
+
     def arrow(self, column: str) -> str:
         """A sign at the column that the list is sorted by."""
         return {column: " ▲", f"-{column}": " ▼"}.get(self.sort, "")
 
     def _address(self, more: dict[str, str]) -> str:
         return f"{self.root}/?{urlencode(self.query | more, errors='replace')}#{self.key}"
+
+
+def _campaign_of(campaigns: Sequence[str], entry: Entry) -> str:
+    """The campaign whose folder a file lies in, the innermost one; empty where there is none."""
+    inside = [name for name in campaigns if entry.name.startswith(f"{name}/")]
+    return max(inside, key=len, default="")
 
 
 def browse(request: Request) -> HTMLResponse:
@@ -85,17 +125,25 @@ def browse(request: Request) -> HTMLResponse:
     jobs = Jobs(library.root)
     entries = library.entries()
     words = query.lower().split()
-    found = [e for e in entries if all(word in e.words for word in words)]
+    notes = notes_of(library)
+    none = Note()
+    found = [e for e in entries if all(w in e.words or w in notes.get(e.name, none).words for w in words)]
     views = [view for f in library.campaigns() if (view := read_campaign(f, library)) is not None]
     campaigns = [(v, running_in(library.root / v.name)) for v in views if all(w in v.name.lower() for w in words)]
-    products = Listed.of([e for e in found if e.kind not in ("capture", "unreadable")], "products", request, pages.root)
+    products = Listed.of([e for e in found if e.kind not in ("capture", "unreadable")], "products", request)
     return pages.draw(
         "browse.html",
         simulated=_all_simulated(found),
         query=query,
         campaigns=campaigns,
         statuses=STATUS,
-        captures=Listed.of([e for e in found if e.kind in ("capture", "unreadable")], "captures", request, pages.root),
+        captures=Listed.of(
+            [e for e in found if e.kind in ("capture", "unreadable")],
+            "captures",
+            request,
+            {"campaign": partial(_campaign_of, [view.name for view in views]), "sample": lambda e: e.sample},
+        ),
+        notes=notes,
         products=products,
         sources=[made_from(e, entries, library.root) for e in products.entries],
         found=len(found),

@@ -15,6 +15,7 @@ from processing.reports.capture_facts import facts_of, papers_of
 from processing.storage.captures.capture import Capture
 from viewer.diagnoses import Diagnoses
 from viewer.library import Entry, made_into
+from viewer.notes import Note, notes_of
 from viewer.pages import file_of, pages_of
 from viewer.planes import Window, sent
 from viewer.starting import geometry_files, instrument_files, material_files
@@ -47,6 +48,7 @@ def capture(request: Request) -> HTMLResponse:
         "capture.html",
         simulated=entry.simulated,
         entry=entry,
+        note=notes_of(library).get(entry.name, Note()),
         facts=facts,
         notes=notes,
         warnings=warnings,

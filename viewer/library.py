@@ -69,6 +69,11 @@ class Entry:
         return self.header.title if self.header is not None else Path(self.name).name
 
     @property
+    def sample(self) -> str:
+        """Name of the sample, or its kind; empty where the file has no header."""
+        return "" if self.header is None else self.header.sample.name or self.header.sample.kind
+
+    @property
     def words(self) -> str:
         """What a search looks through, in small letters."""
         parts = [self.name, self.kind, self.status, self.step, *self.flags]

@@ -18,6 +18,7 @@ from processing.storage.products.product import COMPANIONS, LIT_ERRORS, Product
 from processing.storage.products.provenance import steps_text
 from viewer.frames import others
 from viewer.library import made_from, made_into
+from viewer.notes import Note, notes_of
 from viewer.pages import file_of, pages_of
 from viewer.planes import Window, sent
 
@@ -49,6 +50,7 @@ def product(request: Request) -> HTMLResponse:
         "product.html",
         simulated=entry.simulated,
         entry=entry,
+        note=notes_of(library).get(entry.name, Note()),
         kind=kind,
         facts=facts,
         provenance=provenance,

@@ -13,12 +13,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
-from processing.doors import read_json
 from processing.errors import ProcessError
 from processing.maps.means import mean_of
 from processing.maps.stokes_vector import is_stokes_vector
@@ -27,13 +26,13 @@ from processing.reports.colours import period_deg
 from processing.storage.captures.capture import Capture
 from processing.storage.products.images import neighbour_correlation
 from processing.storage.products.product import Product, is_product
-from processing.whole_file import write_whole_text
 from viewer.comparing import asked_of, capture_values, product_values, states_to_choose
-from viewer.library import OWN, Library, NotHere
+from viewer.library import Library, NotHere
 from viewer.pages import fields_of, file_of, pages_of
 from viewer.planes import Window
 from viewer.probing import MOST, Region, finite
 from viewer.products import choices_of, units_words
+from viewer.side_files import read_kept, write_kept
 
 #: Name of the file, in the folder of the application's own files.
 FILE = "regions.json"
@@ -69,27 +68,12 @@ class NamedRegion(BaseModel):
 class _Kept(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
-    regions: list[NamedRegion]
+    regions: list[NamedRegion] = []
 
 
 def kept_regions(library: Library) -> list[NamedRegion]:
     """The regions of a folder, in the order in which they were named. Raises ProcessError for a damaged file."""
-    path = library.root / OWN / FILE
-    if not path.exists():
-        return []
-    try:
-        return _Kept.model_validate(read_json(path)).regions
-    except ValidationError as error:
-        raise ProcessError(f"{path} holds no regions. Correct it, or move it away.") from error
-
-
-def _keep(library: Library, regions: list[NamedRegion]) -> None:
-    path = library.root / OWN / FILE
-    try:
-        path.parent.mkdir(exist_ok=True)
-        write_whole_text(path, _Kept(regions=regions).model_dump_json(indent=1) + "\n")
-    except OSError as error:
-        raise ProcessError(f"{path}: the regions cannot be kept ({error.strerror})") from error
+    return read_kept(library, FILE, _Kept).regions
 
 
 async def keep_region(request: Request) -> JSONResponse:
@@ -107,7 +91,7 @@ def _keep_region(library: Library, asked: dict[str, str]) -> JSONResponse:
     fresh = NamedRegion(name=name, columns=columns, rows=rows, image=shape)
     with _lock:
         by_name = {one.name: one for one in kept_regions(library)} | {name: fresh}
-        _keep(library, list(by_name.values()))
+        write_kept(library, FILE, _Kept(regions=list(by_name.values())))
     return JSONResponse({"name": name})
 
 
@@ -122,7 +106,7 @@ def _drop_region(library: Library, name: str) -> JSONResponse:
         kept = kept_regions(library)
         if all(one.name != name for one in kept):
             raise NotHere(f"{name}: there is no such region")
-        _keep(library, [one for one in kept if one.name != name])
+        write_kept(library, FILE, _Kept(regions=[one for one in kept if one.name != name]))
     return JSONResponse({"name": name})
 
 

@@ -1,4 +1,4 @@
-// Forms that start something: what they hold is sent, and the page that follows it is opened.
+// Forms that start something: what they hold is sent, and the page that follows it is opened. And the note of a file.
 
 import { post, say } from "./plots.js";
 
@@ -26,3 +26,17 @@ const enable = () => forms.forEach(form => { buttonOf(form).disabled = false; })
 enable();
 // A page that is gone back to is as it was left.
 addEventListener("pageshow", event => { if (event.persisted) enable(); });
+
+const note = document.getElementById("file-note");
+note?.addEventListener("submit", async event => {
+  event.preventDefault();
+  const answer = note.querySelector("[role=status]"), { tags, text } = note.elements;
+  try {
+    const kept = await post("note", { file: note.dataset.file, tags: tags.value, text: text.value });
+    tags.value = kept.tags.join(", ");
+    answer.textContent = "kept";
+  } catch (error) {
+    say(answer, error);
+  }
+});
+if (note) buttonOf(note).disabled = false;
