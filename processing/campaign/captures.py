@@ -9,7 +9,7 @@ from typing import NamedTuple
 from processing.doors import read_json
 from processing.errors import ProcessError
 from processing.reduction.flat import FlatCapture, flat_captures, nearest_flat
-from processing.storage.captures.capture import Capture, CaptureError, made_of_captures
+from processing.storage.captures.capture import Capture, CaptureError, NotACapture, made_of_captures
 
 
 class ObjectCapture(NamedTuple):
@@ -27,10 +27,17 @@ class ObjectCapture(NamedTuple):
     is_reference: bool = False
 
 
-def find_captures(
-    folder: Path, out: Path | None = None, of_objects: bool = True
-) -> tuple[list[ObjectCapture], bool, list[str]]:
-    """Captures under a folder, whether they are simulated, and files left out.
+class FoundCaptures(NamedTuple):
+    """Captures under a folder, whether they are simulated, files left out, and damaged files with their errors."""
+
+    captures: list[ObjectCapture]
+    simulated: bool
+    left_out: list[str]
+    damaged: list[tuple[Path, Exception]]
+
+
+def find_captures(folder: Path, out: Path | None = None, of_objects: bool = True) -> FoundCaptures:
+    """Look for captures under a folder.
 
     Flat fields are in neither list, nor is anything in `out`, the campaign's own results. `of_objects`: leave out air,
     mirrors and captures without an arm angle.
@@ -40,6 +47,7 @@ def find_captures(
     ProcessError : no capture, or simulated and measured ones together.
     """
     found, kinds, left_out = [], {}, []
+    damaged: list[tuple[Path, Exception]] = []
     for path in sorted(folder.rglob("*.h5")):
         if (out is not None and path.is_relative_to(out)) or made_of_captures(path):
             continue
@@ -48,8 +56,11 @@ def find_captures(
                 header, simulated, flat = capture.header, capture.simulated, FlatCapture.of(capture)
                 kind: str = capture.reduces_to
                 done, planned, status = len(capture.done), capture.planned_states, capture.status
-        except CaptureError as error:
+        except NotACapture as error:
             left_out.append(f"{path}: {error}")
+            continue
+        except CaptureError as error:
+            damaged.append((path, error))
             continue
         if done < planned or status != "complete":
             left_out.append(f"{path}: {done} of {planned} states, {status}; `acquire` goes on with it")
@@ -68,7 +79,7 @@ def find_captures(
     if not found:
         raise ProcessError(
             f"{folder} holds no complete capture{' of an object with an arm angle' * of_objects}. "
-            f"{' '.join(left_out[:3])}"
+            f"{' '.join([*(str(error) for _, error in damaged), *left_out][:3])}"
         )
     if len(set(kinds.values())) > 1:
         simulated_one = next(p for p, s in kinds.items() if s)
@@ -77,7 +88,7 @@ def find_captures(
             f"{folder} mixes simulated captures ({simulated_one.name}) and measured ones ({measured_one.name}); "
             "they are never compared as one campaign. Put them into two folders."
         )
-    return found, next(iter(kinds.values())), left_out
+    return FoundCaptures(found, next(iter(kinds.values())), left_out, damaged)
 
 
 def _unfinished(folder: Path, out: Path | None) -> list[str]:

@@ -77,7 +77,7 @@ class Curves:
         ------
         ProcessError : see `find_captures` and `chosen`.
         """
-        found, simulated, left_out = find_captures(self.folder, self.out, of_objects=False)
+        found, simulated, left_out, damaged = find_captures(self.folder, self.out, of_objects=False)
         captures, others = chosen(found, self.modes, self.samples, twins=True)
         self.out.mkdir(parents=True, exist_ok=True)
         flats, corrected = flats_of(self.folder, captures), self.instruments or {}
@@ -93,7 +93,7 @@ class Curves:
         ]
         results = gather(pool, curve_point, tasks, progress)
         paths = [capture.path for capture in captures]
-        return list(zip(paths, results, strict=True)), simulated, left_out + others
+        return [*zip(paths, results, strict=True), *damaged], simulated, left_out + others
 
 
 @one_blas_thread()

@@ -126,7 +126,7 @@ class Campaign:
         ------
         ProcessError : see `find_captures` and `chosen`.
         """
-        found, simulated, left_out = find_captures(self.folder, self.out)
+        found, simulated, left_out, damaged = find_captures(self.folder, self.out)
         captures, others = chosen(found, self.modes, self.samples)
         left_out = left_out + others
         self.out.mkdir(parents=True, exist_ok=True)
@@ -138,7 +138,7 @@ class Campaign:
         results = gather(pool, measure, tasks, progress)
         measures = [result for result in results if isinstance(result, CaptureMeasure)]
         pairs = zip(captures, results, strict=True)
-        failed = tuple((capture.path, result) for capture, result in pairs if isinstance(result, Exception))
+        failed = (*damaged, *((one.path, result) for one, result in pairs if isinstance(result, Exception)))
         tables = _merged_tables(measures, self.out)
         rows = tuple(_rows(measures, tables, views))
         names = {path.name: flat.name for path, flat in flats.items()}

@@ -166,7 +166,7 @@ def _corrected(folder: Path, target: Path) -> dict[Path, Path]:
 
     captures: dict[str, list[Path]] = {}
     airs: dict[str, list[Path]] = {}
-    for path, *_ in find_captures(folder, target, of_objects=False)[0]:
+    for path, *_ in find_captures(folder, target, of_objects=False).captures:
         with Capture(path) as capture:
             text, is_air = capture.header.instrument_yaml, capture.header.sample.kind == "air"
         captures.setdefault(text, []).append(path)

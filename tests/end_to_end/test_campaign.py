@@ -121,6 +121,24 @@ def test_without_a_geometry_every_capture_has_its_means(folder, configs, process
     assert (code, "--quantity beauty: no such quantity. There are: " in err) == (2, True)
 
 
+def test_a_damaged_capture_is_reported_and_the_rest_is_made(configs, process, tmp_path):
+    whole = small(tmp_path, configs, "whole", 20)
+    content = whole.read_bytes()
+    (tmp_path / "torn.h5").write_bytes(content[: len(content) // 2])
+    with h5py.File(tmp_path / "foreign.h5", "w") as h5:
+        h5["mesh"] = [1.0, 2.0]
+    code, out, err = process("campaign", tmp_path)
+    assert code == 2, err
+    assert [line.split()[0] for line in out.splitlines() if ".mueller.h5" in line] == ["made"]
+    assert "left out" in err.split("foreign.h5")[0]
+    assert "torn.h5" in err.split("failed:")[1]
+    assert "1 capture failed" in err
+    # With a geometry as well.
+    code, out, err = process("campaign", tmp_path, "--out", tmp_path / "surface", *options(configs))
+    assert code == 2, err
+    assert "torn.h5" in err.split("failed:")[1]
+
+
 def test_half_of_a_geometry_is_refused(folder, configs, process):
     code, _, err = process("campaign", folder, *options(configs)[:2])
     assert (code, "--geometry FILE and --material FILE go together" in err) == (2, True)

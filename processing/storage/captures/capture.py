@@ -32,6 +32,10 @@ class CaptureError(ProcessError):
     """A capture cannot be used; the message says what was expected, what was found and what to do."""
 
 
+class NotACapture(CaptureError):
+    """A whole HDF5 file that is something else."""
+
+
 class Capture(OpenH5):
     """One capture file, open for reading. States not marked done do not exist for a reader.
 
@@ -68,7 +72,7 @@ class Capture(OpenH5):
     def _read(self) -> None:
         if "umov_schema" not in self._h5.attrs:
             made = next((what for mark, what in MADE_OF_CAPTURES.items() if mark in self._h5.attrs), None)
-            raise CaptureError(
+            raise NotACapture(
                 f"{self.path} is HDF5 but no umov capture. If it comes from elsewhere, use `process import`."
                 if made is None
                 else f"{self.path} is {made}, and a capture is asked for: the file that it was made from."
