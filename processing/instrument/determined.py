@@ -21,7 +21,8 @@ def determined_basis(model: InstrumentModel) -> Array:
     """
     random = np.random.default_rng(0)
     ideal = model.model_copy(update={"effects": ()})
-    w = ideal.rows({axis: random.uniform(0, 360, DRAWN) for axis in model.axes}).reshape(-1, 16)
+    drawn = {axis: random.uniform(0, 360, DRAWN) for axis in model.axes}
+    w = ideal.rows(drawn if model.measured is None else model.measured.angles_deg).reshape(-1, 16)
     _, size, vt = np.linalg.svd(w, full_matrices=False)
     found = np.asarray(vt[size > LEAST * size[0]].T)
     return np.eye(16) if found.shape[1] == 16 else found

@@ -74,14 +74,17 @@ class Element(Part):
 
 
 class Polarizer(Element):
-    """Linear polarizer; `extinction` is the intensity leak T_min/T_max."""
+    """Polarizer; `extinction` is the intensity leak T_min/T_max, `ellipticity_deg` that of what it transmits."""
 
     kind: Literal["polarizer"]
     extinction: Stated = Field(default=0.0, description="intensity leak T_min / T_max")
+    ellipticity_deg: Stated = Field(
+        default=0.0, description="ellipticity of the light that it transmits, degrees; 0 linear, 45 right circular"
+    )
 
     def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
         extinction = number(self.extinction) + (changes.extinction[self.name] if changes else 0.0)
-        return mueller.polarizer(azimuth_rad, extinction)
+        return mueller.polarizer(azimuth_rad, extinction, np.deg2rad(number(self.ellipticity_deg)))
 
 
 class Retarder(Element):

@@ -25,6 +25,7 @@ from processing.instrument.elements import WavelengthError as WavelengthError
 from processing.instrument.fitted import AppliedEffect as AppliedEffect
 from processing.instrument.fitted import EffectParameter as EffectParameter
 from processing.instrument.fitted import SystematicError as SystematicError
+from processing.instrument.measured import MeasuredMatrix
 from processing.instrument.stated import TRAINS, Correlation, without_u
 from processing.yaml_file import load_yaml
 
@@ -56,6 +57,7 @@ class InstrumentModel(Part):
 
     `mosaic`, for a division-of-focal-plane sensor, lays out the channel names over the super-pixel, row by
     row from the top left, e.g. (("90", "45"), ("135", "0")).
+    `measured` holds W itself, for instruments that no train of elements describes; then there are no elements.
     `beams` names the channels whose images lie side by side on one detector, in equal parts of its columns.
     `calibrate` names values ("element.field", "channel.gain") that are only nominal: `diagnose` fits them to captures
     of known samples.
@@ -93,6 +95,9 @@ class InstrumentModel(Part):
     channels: tuple[Channel, ...] = Field(
         default=(Channel(name="camera"),),
         description="detector channels, each with the elements that its light alone passes",
+    )
+    measured: MeasuredMatrix | None = Field(
+        default=None, description="W that was measured as a whole, instead of elements"
     )
     mosaic: tuple[tuple[str, ...], ...] | None = Field(
         default=None, description="names of the channels over the super-pixel of a polarization camera"
@@ -147,6 +152,8 @@ class InstrumentModel(Part):
         channels = [c.name for c in self.channels]
         if len(set(channels)) != len(channels):
             raise ValueError("channel names must be unique")
+        if self.measured is not None and (names or len(self.measured.rows) != self.measured.states * len(channels)):
+            raise ValueError("a measured W has no elements, and one row for each state and channel")
         if self.free_source and len(channels) < 2:
             raise ValueError("free_source needs two channels or more: with one, nothing is left over")
         if self.mosaic is not None and sorted(n for row in self.mosaic for n in row) != sorted(channels):
@@ -179,7 +186,9 @@ class InstrumentModel(Part):
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Names of the axes that turn elements, sorted."""
+        """Names of the axes that turn elements, or that tell the states of a measured W apart, sorted."""
+        if self.measured is not None:
+            return tuple(sorted(self.measured.angles_deg))
         return tuple(sorted({e.axis for e in self.elements() if e.axis is not None}))
 
     def at(self, wavelength_nm: float) -> InstrumentModel:
@@ -288,6 +297,9 @@ class InstrumentModel(Part):
         """
         if changes is None and self.effects:
             raise ValueError(f"instrument {self.name!r} has effects: rows() needs the changes that they make")
+        if self.measured is not None:
+            w = self.measured.at(angles_deg)
+            return w if changes is None else _detected(w, changes)
         g = self.generator_states(angles_deg, changes)
         a = self.analyzer_states(angles_deg, changes)
         w = np.asarray((a[..., :, None] * g[:, None, None, :]).reshape(*a.shape[:2], 16))

@@ -77,12 +77,21 @@ def diattenuator(azimuth: ArrayLike, t_max: ArrayLike, t_min: ArrayLike) -> Arra
     )
 
 
-def polarizer(azimuth: ArrayLike, extinction: ArrayLike = 0.0) -> Array:
-    """Linear polarizer with its transmission axis at `azimuth`; it carries its factor 1/2.
+def polarizer(azimuth: ArrayLike, extinction: ArrayLike = 0.0, ellipticity: ArrayLike = 0.0) -> Array:
+    """Polarizer with its transmission axis at `azimuth`; it carries its factor 1/2.
 
-    `extinction` is the intensity leak T_min / T_max (0 = ideal).
+    `extinction` is the intensity leak T_min / T_max (0 = ideal). It transmits the state of `ellipticity` in radians,
+    positive for right-handed: 0 linear, pi/4 circular.
     """
-    return diattenuator(azimuth, 1.0, extinction)
+    if not np.any(ellipticity):
+        return diattenuator(azimuth, 1.0, extinction)
+    t, e, leak = np.broadcast_arrays(*(np.asarray(v, dtype=float) for v in (azimuth, ellipticity, extinction)))
+    a, b, g = (1 + leak) / 2, (1 - leak) / 2, np.sqrt(np.maximum(leak, 0.0))
+    d = np.stack([np.cos(2 * e) * np.cos(2 * t), np.cos(2 * e) * np.sin(2 * t), np.sin(2 * e)], axis=-1)
+    out = np.empty((*d.shape[:-1], 4, 4))
+    out[..., 0, 0], out[..., 0, 1:], out[..., 1:, 0] = a, b[..., None] * d, b[..., None] * d
+    out[..., 1:, 1:] = g[..., None, None] * np.eye(3) + (a - g)[..., None, None] * d[..., None] * d[..., None, :]
+    return out
 
 
 def from_jones(jones: ArrayLike) -> Array:

@@ -14,6 +14,7 @@ from scipy.io import savemat
 from processing.commands.application import main
 from processing.commands.diagnose import main as diagnose
 from processing.instrument.elements import Diattenuator, Polarizer, Retarder
+from processing.instrument.measured import MeasuredMatrix
 from processing.instrument.model import Channel, InstrumentModel
 from processing.storage.captures.capture import Capture
 from processing.storage.products.images import MuellerImage
@@ -145,6 +146,6 @@ def test_the_tutorial_of_an_own_polarimeter_corrects_its_matrix(tmp_path, proces
 
 def test_the_reference_of_instrument_files_names_every_field():
     page = (ROOT / "docs/instrument-files.md").read_text()
-    fields = {*InstrumentModel.model_fields, *Channel.model_fields}
+    fields = {*InstrumentModel.model_fields, *Channel.model_fields, *MeasuredMatrix.model_fields}
     fields |= {name for kind in (Polarizer, Retarder, Diattenuator) for name in kind.model_fields}
     assert {name for name in fields if f"`{name}`" not in page} == set()

@@ -1,0 +1,58 @@
+"""A measurement matrix W that was measured as a whole, as the states of an instrument."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field, model_validator
+
+from processing.arrays import Array
+from processing.errors import ProcessError
+from processing.instrument.elements import Part
+
+
+class MeasuredMatrix(Part):
+    """Rows of W at the states where they were measured; a capture is of these states, in any order."""
+
+    angles_deg: dict[str, tuple[float, ...]] = Field(
+        min_length=1, description="angle of each axis in each state, degrees; or numbers of the states"
+    )
+    rows: tuple[tuple[float, ...], ...] = Field(
+        description="for each state, and in it for each channel: 16 numbers for M row by row, or 4 for S"
+    )
+    tolerance_deg: float = Field(default=0.1, gt=0, description="most that a state of a capture is away, degrees")
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        lengths = {len(column) for column in self.angles_deg.values()}
+        if len(lengths) != 1 or not self.rows or len(self.rows) % (lengths.pop() or 1):
+            raise ValueError("each axis needs one angle a state, and each state one row for each channel")
+        if {len(row) for row in self.rows} not in ({4}, {16}):
+            raise ValueError("a row has 16 numbers for M, or 4 for S; all rows alike")
+        return self
+
+    @property
+    def states(self) -> int:
+        """How many states were measured."""
+        return len(next(iter(self.angles_deg.values())))
+
+    def at(self, angles_deg: Mapping[str, ArrayLike]) -> Array:
+        """Rows (states, channels, 16) of the states with these angles. Raises ProcessError."""
+        asked = {axis: np.atleast_1d(np.asarray(angles_deg[axis], dtype=float)) for axis in self.angles_deg}
+        off = np.max([np.abs(asked[axis][:, None] - column) for axis, column in self.angles_deg.items()], axis=0)
+        nearest = off.argmin(axis=1)
+        if np.any(far := ~(off.min(axis=1) <= self.tolerance_deg)):
+            state = int(np.flatnonzero(far)[0])
+            place = ", ".join(f"{axis} {column[state]:g}" for axis, column in asked.items())
+            raise ProcessError(
+                f"state {state} has {place} degrees, and W was measured at no such state within "
+                f"{self.tolerance_deg:g} degrees. Take the states of the instrument file, or measure W at these."
+            )
+        rows = np.zeros((len(self.rows), 16))
+        given = np.array(self.rows)
+        # A row of a Stokes polarimeter acts on the first column of M.
+        rows[:, :: 16 // given.shape[1]] = given
+        return np.asarray(rows.reshape(self.states, -1, 16)[nearest])
