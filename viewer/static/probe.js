@@ -120,7 +120,7 @@ const chiSquare = fit => `Chi-square of the fit over its degrees of freedom: ${n
 function simplexPlot() {
   const plot = document.createElement("div");
   plot.className = "plot";
-  plot.setAttribute("role", "img");
+  plot.setAttribute("role", "figure");
   plot.setAttribute("aria-label", "place of the eigenvalues in the simplex");
   return plot;
 }
