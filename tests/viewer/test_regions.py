@@ -141,6 +141,7 @@ def test_every_region_and_quantity_is_a_line_of_a_table(client, drr_capture):
         (0.51234, [0.0021, 0.13], "0.5123 ± 0.0021 ± 0.1300"),
         (0.0000123, [0], "0.0000123 ± 0"),
         (1.5, [None], "1.5 ± ?"),
+        (-0.0002, [0.017], "0.000 ± 0.017"),
     ],
 )
 def test_an_error_has_two_digits_and_its_value_ends_with_it(client, browser, address, value, errors, text):

@@ -111,7 +111,7 @@ export function measured(value, errors) {
     if (least > 0) return String(Math.round(v / 10 ** least) * 10 ** least);
     return least < -12 ? v.toPrecision(6) : v.toFixed(-least);
   };
-  return value === null || value === undefined ? "-" : [value, ...errors].map(shown).join(" ± ");
+  return value === null || value === undefined ? "-" : [value, ...errors].map(shown).join(" ± ").replace(/^-(?=[0.]+ )/, "");
 }
 
 export function duration(seconds) {

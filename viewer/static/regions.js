@@ -81,7 +81,8 @@ export class Regions {
     const unit = this.rows[0].unit, along = byId("along").value;
     const each = drawn => () => this.rows.map((row, k) => ({ name: row.name || "chosen", ...drawn(row, COLOURS[k % COLOURS.length]()) }));
     draw(byId("region-histogram"), each((row, colour) => {
-      const { edges, pixels } = row.histogram;
+      // One pixel has no histogram: its bar would be as wide as the plot.
+      const { edges, pixels } = row.pixels > 1 ? row.histogram : { edges: [], pixels: [] };
       const middle = pixels.map((_, k) => (edges[k] + edges[k + 1]) / 2);
       return { type: "bar", x: middle, y: pixels.map(n => n / row.pixels), width: edges[1] - edges[0], opacity: 0.6, marker: { color: colour, line: { width: 0 } } };
     }), () => ({ barmode: "overlay", bargap: 0, showlegend: this.rows.length > 1, xaxis: { title: { text: unit || "value" } }, yaxis: { title: { text: "share of the pixels" } } }));
