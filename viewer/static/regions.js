@@ -79,13 +79,13 @@ export class Regions {
   plots() {
     if (!this.rows.length) return;
     const unit = this.rows[0].unit, along = byId("along").value;
-    const each = drawn => () => this.rows.map((row, k) => ({ name: row.name || "chosen", ...drawn(row, COLOURS[k % COLOURS.length]()) }));
+    const each = (drawn, least = 1) => () => this.rows.flatMap((row, k) => (row.pixels < least ? [] : [{ name: row.name || "chosen", ...drawn(row, COLOURS[k % COLOURS.length]()) }]));
     draw(byId("region-histogram"), each((row, colour) => {
-      // One pixel has no histogram: its bar would be as wide as the plot.
-      const { edges, pixels } = row.pixels > 1 ? row.histogram : { edges: [], pixels: [] };
+      const { edges, pixels } = row.histogram;
       const middle = pixels.map((_, k) => (edges[k] + edges[k + 1]) / 2);
       return { type: "bar", x: middle, y: pixels.map(n => n / row.pixels), width: edges[1] - edges[0], opacity: 0.6, marker: { color: colour, line: { width: 0 } } };
-    }), () => ({ barmode: "overlay", bargap: 0, showlegend: this.rows.length > 1, xaxis: { title: { text: unit || "value" } }, yaxis: { title: { text: "share of the pixels" } } }));
+    // One pixel has no histogram: its bar would be as wide as the plot.
+    }, 2), () => ({ barmode: "overlay", bargap: 0, showlegend: this.rows.length > 1, xaxis: { title: { text: unit || "value" } }, yaxis: { title: { text: "share of the pixels" } } }));
     draw(byId("region-profile"), each((row, colour) => ({
       mode: "lines", x: row[along].map((_, k) => k + (along === "columns" ? row.x0 : row.y0)), y: row[along], line: { color: colour, width: 1.5 },
     })), () => ({ showlegend: this.rows.length > 1, xaxis: { title: { text: along === "columns" ? "column / pixels" : "row / pixels" } }, yaxis: { title: { text: unit ? `mean / ${unit}` : "mean" } } }));
