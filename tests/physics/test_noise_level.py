@@ -9,6 +9,7 @@ from bench_capture import bench_capture, read
 from processing.diagnosis.captured.screening import screened
 from processing.diagnosis.instrument.diagnose import diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.search.space import Space
 from simulators.blind.real_bench import Disc
 from simulators.blind.undeclared_captures import Bench
 
@@ -54,3 +55,14 @@ def test_an_offset_is_no_other_read_noise(configs, tmp_path):
     found, sure = said(model, ball, air)
     assert found.noise.verdict == "as_declared"
     assert {"psa_retardance", "detector_offset"} <= set(sure)
+
+
+def test_an_offset_that_nothing_else_shows_leaves_the_noise_of_the_light(configs, tmp_path):
+    """Behind it the dark wall scatters otherwise than its counts say, and the ball as before."""
+    bench = Bench(rows=SIDE, columns=SIDE, read_noise=3.0)
+    bench.stored.append(lambda stored: stored + 60)
+    model, data = captured(tmp_path, configs, bench, Disc)
+    problem, nothing = InstrumentProblem(model, [data]), Space(())
+    problem.level_noise(nothing, np.zeros(0))
+    (leveled,) = problem.still
+    assert leveled.slope == pytest.approx(data.slope, rel=0.015)

@@ -82,7 +82,7 @@ class CaptureData:
     clipped_states : (N,) True for states in which some pixel is.
     noise_estimated : slope and floor describe the scatter of these very counts, not the photons and the read-out.
     noise_factors : by which slope and floor were changed from what is stated, since the images show so.
-    noise_level : by which both were scaled beside that.
+    noise_level : by which both were changed beside that.
     true_variance : (N, channels, rows, columns) where the variance is not a line in the counts any more.
     moved_px : (N, 2) by how much each frame was moved back, from what it had moved to the right and down; pixels here.
         That averages the noise of neighbours, and adds no information.
@@ -122,7 +122,7 @@ class CaptureData:
     cut_off: tuple[int, ...] = ()
     noise_estimated: bool = False
     noise_factors: tuple[float, float] = (1.0, 1.0)
-    noise_level: float = 1.0
+    noise_level: tuple[float, float] = (1.0, 1.0)
     true_variance: NDArray[np.float32] | None = None
     moved_px: Array | None = None
     place_px: Array | None = None

@@ -111,8 +111,7 @@ class DetectorNoise:
 
     Attributes
     ----------
-    white, white_error : variance of a pixel over what is declared; each : mean of that over all pixels, whatever their
-        light.
+    white, white_error : variance of a pixel over what is declared.
     shot, dark, covariance : the parts of the variance with and without light over what is declared, (2, 2);
         light_share : part of the variance declared that goes with the light.
     right, down : correlation of neighbours across and down; alike_error : its standard error.
@@ -123,7 +122,6 @@ class DetectorNoise:
 
     white: float
     white_error: float
-    each: float
     shot: float
     dark: float
     covariance: Array
@@ -177,7 +175,8 @@ def _compared(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise
     down = {lag: _half_square(r, expected, lag, 1) for lag in (1, *far)}
     count = np.isfinite(r).sum() * free
     white = float(np.mean([across[lag] for lag in far]))
-    error = white * float(np.sqrt(3 / count))
+    # Bright pixels have most of the variance: what scatters is a sum of as many as they are.
+    error = white * float(np.sqrt(3 * np.nansum(expected**2) / free)) / float(np.nansum(expected))
     rows = _common(r, expected, 2) - white * _within(r, 2, 1 - across[1] / white)
     columns = _common(r, expected, 1) - white * _within(r, 1, 1 - down[1] / white)
     number = free * r.shape[0] * np.array(r.shape[1:])
@@ -188,7 +187,6 @@ def _compared(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise
     return DetectorNoise(
         white=white,
         white_error=error,
-        each=float(np.mean([_of_each(r, expected, lag) for lag in far])),
         shot=shot,
         dark=floor,
         covariance=covariance,
@@ -213,14 +211,6 @@ def _half_square(r: Array, expected: Array, lag: int, axis: int) -> float:
     first, second = _pairs(r, lag, axis)
     one, other = _pairs(expected, lag, axis)
     return float(np.nansum((first - second) ** 2) / np.nansum(np.where(np.isfinite(first - second), one + other, 0)))
-
-
-def _of_each(r: Array, expected: Array, lag: int) -> float:
-    """Squares of differences across so many pixels over the variance that is expected of all rows, mean over pixels."""
-    first, second = _pairs(r, lag, 2)
-    one, other = _pairs(expected, lag, 2)
-    with np.errstate(invalid="ignore"):
-        return float(np.nanmean(np.sum((first - second) ** 2, axis=0) / np.sum(one + other, axis=0)))
 
 
 def _common(r: Array, expected: Array, axis: int) -> float:

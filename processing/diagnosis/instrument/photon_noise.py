@@ -12,12 +12,12 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData, Correct
-from processing.diagnosis.captured.noise import DetectorNoise, detector_noise, noise_factors
+from processing.diagnosis.captured.noise import LEAST_PART, DetectorNoise, detector_noise, noise_factors
 from processing.diagnosis.instrument.features import MARGIN
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.rules import GAIN_OFF, NOISE_OFF
+from processing.diagnosis.search.rules import DARK_NOISE_OFF, GAIN_OFF, NOISE_OFF, SHOWN
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import PointwiseEffect
+from processing.instrument.effects.base import InstrumentEffect, PointwiseEffect
 
 
 def movable(shift_px: Array) -> bool:
@@ -35,8 +35,10 @@ def distance(undone: Mapping[Candidate, Array], space: Space, values: Array, *, 
 
 
 def _exactly_undone(candidate: Candidate, pointwise: bool) -> bool:
-    """Whether a correction can be undone exactly; with `pointwise`, in each pixel by itself."""
-    return isinstance(candidate.effect, PointwiseEffect) or (candidate.moves_image and not pointwise)
+    """Whether a correction has to be undone exactly, as far off a line; with `pointwise`, to know the light."""
+    return (
+        candidate.is_pointwise if pointwise else isinstance(candidate.effect, PointwiseEffect) or candidate.moves_image
+    )
 
 
 def exactly_undone(space: Space, values: Array, *, pointwise: bool = False) -> dict[Candidate, Array]:
@@ -51,8 +53,8 @@ def undoing(data: CaptureData, undone: Mapping[Candidate, Array]) -> Correct:
     def correct(signal: Array) -> tuple[Array, Array]:
         slope = np.ones(())
         for candidate, values in undone.items():
-            if isinstance(candidate.effect, PointwiseEffect):
-                signal, step = candidate.effect.undo(signal, data.conditions, values)
+            if isinstance(candidate.effect, InstrumentEffect) and candidate.is_pointwise:
+                signal, step = candidate.effect.undo(signal, data.conditions, candidate.place, values)
                 slope = slope * step
         return signal, slope
 
@@ -72,30 +74,36 @@ def with_noise_of_light(data: CaptureData, a: Array, bends: Mapping[Candidate, A
     shared = data.shared.shown < 1 or data.shared.wide > 1
     if not data.noise_known or data.noise_estimated or shared:
         return _of_light(data, bends)
-    least, usual = max(abs(data.noise_level - 1), GAIN_OFF), (1.0, 1.0)
+    least, usual = max(abs(data.noise_level[0] - 1), GAIN_OFF), (1.0, 1.0)
     # An offset looks like another read-out noise, and the reverse.
-    data = _scaled(data, usual if bends else data.noise_factors, 1.0)
+    data = _scaled(data, usual if bends else data.noise_factors, usual)
     found = _shown(data, a, bends)
     if found is None:
         return _of_light(data, bends)
     factors = noise_factors(found, 1.0, estimated=False) if bends else data.noise_factors
-    if bends and factors == usual and abs(found.white - 1) > least:
+    if bends and factors == usual and abs(found.white - 1) > least + SHOWN * found.white_error:
         return None
     if factors != data.noise_factors:
-        data = _scaled(data, factors, 1.0)
+        data = _scaled(data, factors, usual)
         found = _shown(data, a, bends) or found
     return _of_light(_scaled(data, factors, _level(found)), bends)
 
 
-def _level(found: DetectorNoise) -> float:
-    """How much larger the noise is than is stated: of few pixels the gain is known better than they show it."""
-    shown = (GAIN_OFF / 2) ** 2 / ((GAIN_OFF / 2) ** 2 + found.white_error**2)
-    return float(np.clip(1 + shown * (found.each - 1), 1 - NOISE_OFF, 1 + NOISE_OFF))
+def _level(found: DetectorNoise) -> tuple[float, float]:
+    """How much larger the noise with and without light is than is stated: the mean under what labs know of both.
+
+    A constant offset that nothing else shows changes the noise without light alone.
+    """
+    both, dark = (GAIN_OFF / 2) ** 2, np.diag([0.0, DARK_NOISE_OFF**2])
+    known = both + dark
+    told = known @ np.linalg.solve(known + found.covariance, np.array([found.shot, found.dark]) - 1)
+    return float(np.clip(1 + told[0], 1 - NOISE_OFF, 1 + NOISE_OFF)), float(max(1 + told[1], LEAST_PART))
 
 
-def _scaled(data: CaptureData, factors: tuple[float, float], level: float) -> CaptureData:
-    """The capture with another noise than is stated, by factors on its parts with and without light and on both."""
-    slope, floor = (new * level / old / data.noise_level for new, old in zip(factors, data.noise_factors, strict=True))
+def _scaled(data: CaptureData, factors: tuple[float, float], level: tuple[float, float]) -> CaptureData:
+    """The capture with another noise than is stated, by factors on its parts with and without light."""
+    old = np.multiply(data.noise_factors, data.noise_level)
+    slope, floor = np.multiply(factors, level) / old
     return replace(data, slope=data.slope * slope, floor=data.floor * floor, noise_factors=factors, noise_level=level)
 
 

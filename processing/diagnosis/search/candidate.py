@@ -61,6 +61,11 @@ class Candidate:
         """Whether it moves the image, and is undone by moving the frames back."""
         return isinstance(self.effect, InstrumentEffect) and self.effect.moves_image(self.place)
 
+    @property
+    def is_pointwise(self) -> bool:
+        """Whether it changes every count by itself."""
+        return isinstance(self.effect, InstrumentEffect) and self.effect.is_pointwise(self.place)
+
     def shifts(self, model: InstrumentModel) -> tuple[str, ...]:
         """Values of the train that it shifts and does nothing else."""
         return self.effect.shifts(model, self.place) if isinstance(self.effect, InstrumentEffect) else ()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument import grammar
@@ -31,6 +33,13 @@ class SentenceEffect(OpticsEffect):
 
     def acts_on_counts(self, place: str) -> bool:
         return grammar.parsed(place).site in ("detector", "image")
+
+    def is_pointwise(self, place: str) -> bool:
+        return grammar.parsed(place).quantities == ("offset",)
+
+    def undo(self, signal: Array, conditions: Conditions, place: str, values: Array) -> tuple[Array, Array]:
+        offset = values @ grammar.course(grammar.parsed(place).course, conditions)
+        return signal - offset.reshape(-1, *(1,) * (signal.ndim - 1)), np.ones_like(signal)
 
     def log_price(self, model: InstrumentModel, conditions: Conditions, place: str) -> float:
         return next(s.price for s in grammar.sentences(model, conditions) if s.text == place)

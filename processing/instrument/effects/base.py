@@ -55,6 +55,14 @@ class InstrumentEffect(Effect, ABC):
         """Whether it changes the counts at this place: the image is moved, or the response is bent or shifted."""
         return False
 
+    def is_pointwise(self, place: str) -> bool:
+        """Whether it changes every count by itself at this place, so that `undo` gives the counts of the light."""
+        return False
+
+    def undo(self, signal: Array, conditions: Conditions, place: str, values: Array) -> tuple[Array, Array]:
+        """Signal (N, channels, ...), counts over full scale, without a pointwise effect, exactly, and its slope."""
+        raise NotImplementedError(f"{self.kind} at {place!r} is not pointwise")
+
     def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
         """Values of the train ("element.field") that it shifts and does nothing else."""
         return ()
@@ -92,9 +100,8 @@ class CountsEffect(InstrumentEffect):
 class PointwiseEffect(CountsEffect):
     """Undone in each pixel by itself; what `apply` adds is a series about the last point of `undo`."""
 
-    @abstractmethod
-    def undo(self, signal: Array, conditions: Conditions, values: Array) -> tuple[Array, Array]:
-        """Signal (counts over full scale) without the effect, exactly, and its slope."""
+    def is_pointwise(self, place: str) -> bool:
+        return True
 
 
 class ResponseCurve(PointwiseEffect):

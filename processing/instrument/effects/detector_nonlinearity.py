@@ -35,7 +35,7 @@ class DetectorNonlinearity(ResponseCurve, GeneralEffect):
         for name, factor in (("square", c), ("cube", 2 * c**2), ("fourth", 5 * c**3)):
             changes.response[name] = changes.response[name] + factor
 
-    def undo(self, signal: Array, conditions: Conditions, values: Array) -> tuple[Array, Array]:
+    def undo(self, signal: Array, conditions: Conditions, place: str, values: Array) -> tuple[Array, Array]:
         # y = x - c x^2 has its top at y = 1 / (4 c), beyond the range for the bounds of c.
         root = np.sqrt(np.maximum(1 - 4 * values[0] * signal, 0.01))
         return 2 * signal / (1 + root), 1 / root

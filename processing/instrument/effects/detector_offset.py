@@ -33,5 +33,5 @@ class DetectorOffset(PointwiseEffect):
         full_scale = changes.conditions.full_scale
         changes.response["one"] = changes.response["one"] - values[0] / full_scale
 
-    def undo(self, signal: Array, conditions: Conditions, values: Array) -> tuple[Array, Array]:
+    def undo(self, signal: Array, conditions: Conditions, place: str, values: Array) -> tuple[Array, Array]:
         return signal - values[0] / conditions.full_scale, np.ones_like(signal)

@@ -32,6 +32,6 @@ class ToneCurve(ResponseCurve):
         for name, factor in (("log", e), ("log_square", e * e / 2), ("log_cube", e**3 / 6)):
             changes.response[name] = changes.response[name] + factor
 
-    def undo(self, signal: Array, conditions: Conditions, values: Array) -> tuple[Array, Array]:
+    def undo(self, signal: Array, conditions: Conditions, place: str, values: Array) -> tuple[Array, Array]:
         power = np.maximum(signal, STRAIGHT_BELOW) ** values[0]
         return signal * power, (1 + values[0] * (signal > STRAIGHT_BELOW)) * power
