@@ -5,7 +5,9 @@ import pytest
 
 from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE, PART_OF_LEFT
 from processing.diagnosis.instrument.guard import chances, lasts
-from processing.diagnosis.search.decision import NOTHING, predicted_change
+from processing.diagnosis.search.decision import PredictedChange, predicted_change
+
+NOTHING = PredictedChange(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def test_chance_that_m_gets_worse_is_that_of_draws_from_the_posterior() -> None:

@@ -75,14 +75,8 @@ def inside(height: int, width: int) -> NDArray[np.bool_]:
     return out
 
 
-def image_derivatives(u: NDArray[np.floating]) -> NDArray[np.float32]:
-    """dx, dy, dxx, dxy, dyy (5, L, rows, columns) of images (L, rows, columns); zero if the image is too small."""
-    height, width = u.shape[1:]
-    return derivatives_of_part(u, slice(0, height), slice(0, width))
-
-
 def derivatives_of_part(u: NDArray[np.floating], rows: slice, columns: slice) -> NDArray[np.float32]:
-    """The same of a rectangle of the images alone."""
+    """dx, dy, dxx, dxy, dyy (5, L, rows, columns) of a rectangle of images (L, ...); zero if these are too small."""
     height, width = rows.stop - rows.start, columns.stop - columns.start
     out = np.zeros((DERIVATIVES, u.shape[0], height, width), dtype=np.float32)
     if not derivatives_known(*u.shape[1:]):

@@ -87,9 +87,6 @@ class PredictedChange:
         return round(self.chance_worse, 4)
 
 
-NOTHING = PredictedChange(0.0, 0.0, 0.0, 0.0, 0.0)
-
-
 def predicted_change(given: Array, mean: Array, covariance: Array, products: Array) -> PredictedChange:
     """Of values `given` (K,), where the true ones have a mean (K,) and a covariance (K, K).
 
