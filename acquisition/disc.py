@@ -108,7 +108,7 @@ class DiscProcess:
             raise
 
     def submit(self, function: Callable[..., T], *arguments: Any, frame: NDArray[Any] | None = None) -> Future[T]:
-        """Have a function of a module called there; `frame`, if any, arrives as its last argument."""
+        """Have a function of a module called there; `frame`, if any, arrives as the argument of that name."""
         future: Future[T] = Future()
         if self.has_ended:
             future.set_exception(_ended())
@@ -278,7 +278,7 @@ def _serve(line: Connection, frame: SharedFrame, dies_with: int) -> NoReturn:
                 # Relative names are those of the program, which may have changed its folder since.
                 if folder is not None:
                     os.chdir(folder)
-                answer = True, function(*arguments, *([] if shared is None else [frame.array(*shared)]))
+                answer = True, function(*arguments, **({} if shared is None else {"frame": frame.array(*shared)}))
             except BaseException as error:  # noqa: BLE001 - raised again by the caller
                 answer = False, ExceptionWithTraceback(error, error.__traceback__)
             _send(line, answer)

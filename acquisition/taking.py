@@ -19,7 +19,7 @@ from acquisition.stop_request import StopRequest
 
 
 def take_capture(
-    plan: MeasurementPlan, rig: RigConfig, folder: Path | str, home: bool = False, observers: Sequence[Observer] = ()
+    plan: MeasurementPlan, rig: RigConfig, folder: Path | str, home: bool = False, *, observers: Sequence[Observer] = ()
 ) -> Path:
     """Check everything, take the capture, seal it; Ctrl-C ends it after the state that is being taken.
 
@@ -44,7 +44,7 @@ def take_capture(
     with StopRequest() as stop, open_rig(rig) as devices:
         refuse_failed(check_with_devices(job, devices, Path(folder)))
         with free_name(Path(folder) / default_name(plan)) as path:
-            result = session.take(job, devices, path, stop, observers, home=home)
+            result = session.take(job, devices, path, stop, observers=observers, home=home)
     if result.status != "complete":
         raise AcquisitionError(f"{result.path} was stopped ({result.status}); `acquire --resume` continues it.")
     return result.path

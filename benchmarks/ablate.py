@@ -73,7 +73,7 @@ def judged(folder: Path, seeds: Sequence[int], given: str) -> list[dict[str, Any
 
 
 def in_a_process_of_its_own(
-    folder: Path, seeds: Sequence[int], given: str, name: str = "", factor: float = 1.0
+    folder: Path, seeds: Sequence[int], given: str, name: str = "", *, factor: float = 1.0
 ) -> list[dict[str, Any]]:
     """The same in a new process, which reads the changed number."""
     command = [sys.executable, __file__, name, "--child", str(folder), "--factor", str(factor), "--given", given]
@@ -99,7 +99,8 @@ def lines(names: Sequence[str], folder: Path, seeds: Sequence[int], given: str) 
     yield f"{'as they are':28s} {'':6s} {row(plain, plain)}"
     for name in names:
         for factor in FACTORS:
-            yield f"{name:28s} {factor:6g} {row(in_a_process_of_its_own(folder, seeds, given, name, factor), plain)}"
+            changed = in_a_process_of_its_own(folder, seeds, given, name, factor=factor)
+            yield f"{name:28s} {factor:6g} {row(changed, plain)}"
 
 
 def main() -> None:
@@ -124,7 +125,7 @@ def main() -> None:
 
     folder = Path(mkdtemp(prefix="ablate_"))
     for seed in seeds:
-        make_bench(folder, seed, ROOT / "configs", "real", options.pixels)
+        make_bench(folder, seed, ROOT / "configs", "real", pixels=options.pixels)
     for line in lines(options.names or sorted(numbers()), folder, seeds, options.given):
         print(line, flush=True)
 

@@ -156,7 +156,9 @@ def residual(effect: BenchEffect, scene: SceneImage, omega_deg: float) -> NDArra
     model = InstrumentModel.load(CONFIGS / "instruments/rgb950.yaml")
     table = rotating_retarders(EXPOSURE_S)
     angles = {axis: np.asarray(values) for axis, values in table.angles_deg.items()}
-    bench = SimulatedBench(scene, model, WAVELENGTH_NM, SIDE, SIDE, flux_e_per_s=FLUX, seed=1, effects=(effect,))
+    bench = SimulatedBench(
+        scene, model, WAVELENGTH_NM, rows=SIDE, columns=SIDE, flux_e_per_s=FLUX, seed=1, effects=(effect,)
+    )
     frames = []
     for k in range(len(table)):
         here = {axis: float(values[k]) for axis, values in angles.items()}

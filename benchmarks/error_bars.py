@@ -64,6 +64,7 @@ def cells(
     darks: int,
     electrons: float,
     pixels: int,
+    *,
     samples: Sequence[str] = (),
     extra: Sequence[str] = EXTRA,
 ) -> Iterator[Cell]:

@@ -164,9 +164,15 @@ def emulated(
         true = true.with_values({place: {field: float(true.value_of(value) or 0.0) + by}})  # type: ignore[arg-type]
     random = np.random.default_rng(seed)
     air = emulated_capture(
-        true, bench, np.eye(4), "air", file, random, fault(bench, np.random.default_rng(seed)) if fault else None
+        true,
+        bench,
+        np.eye(4),
+        "air",
+        file=file,
+        random=random,
+        wrong=fault(bench, np.random.default_rng(seed)) if fault else None,
     )
-    other = emulated_capture(true, bench, SAMPLE, "unknown", file, random)
+    other = emulated_capture(true, bench, SAMPLE, "unknown", file=file, random=random)
 
     def truth(product: dict[str, Array]) -> Array:
         if "stokes" not in product:
@@ -174,7 +180,7 @@ def emulated(
         sent = SAMPLE @ true.generator_states({})[0]
         return np.asarray(sent / sent[0])
 
-    return chain(name, air, other, file, truth, "the emulated sample")
+    return chain(name, air, other, file, truth=truth, reference="the emulated sample")
 
 
 #: Angles of the axes as they were, and the level of the source (states,), of a capture with a fault.
@@ -211,7 +217,7 @@ OF_AIR = {"slips": _slips, "source": _smooth_source, "angles": _angles}
 
 
 def chain(
-    name: str, air: Path, other: Path, file: Path, truth: Callable[[dict[str, Array]], Array], reference: str
+    name: str, air: Path, other: Path, file: Path, *, truth: Callable[[dict[str, Array]], Array], reference: str
 ) -> Row:
     """Diagnose a capture, write, and reduce another with both files."""
     model = InstrumentModel.load(file)
@@ -255,7 +261,7 @@ def half_wave_plate(nm: int, files: Mapping[str, Path], folder: Path, draw: int 
     if draw:
         kept = sorted(np.random.default_rng(draw).choice(len(air.rows), len(air.rows) - 10, replace=False))
         air = replace(air, rows=tuple(f"{n},{air.rows[k].partition(',')[2]}" for n, k in enumerate(kept)))
-    return _measured("drr_wollaston", (air, plate), folder, truth, "the ratio of the channels")
+    return _measured("drr_wollaston", (air, plate), folder, truth, reference="the ratio of the channels")
 
 
 def mirror_frames(folder: Path) -> Row:
@@ -265,7 +271,7 @@ def mirror_frames(folder: Path) -> Row:
     first = replace(table, name="first_turn", rows=table.rows[:half])
     second = replace(table, name="second_turn", sample="unknown", rows=table.rows[half:])
     mirror = np.diag([1.0, 1.0, -1.0, -1.0])
-    return _measured("drr_imaging_630nm", (first, second), folder, lambda product: mirror, "a mirror")
+    return _measured("drr_imaging_630nm", (first, second), folder, lambda product: mirror, reference="a mirror")
 
 
 def _measured(
@@ -273,6 +279,7 @@ def _measured(
     tables: tuple[StateTable, StateTable],
     folder: Path,
     truth: Callable[[dict[str, Array]], Array],
+    *,
     reference: str,
 ) -> Row:
     """The chain on two captures of public data, the known sample first."""
@@ -291,7 +298,7 @@ def _measured(
         import_capture(request)
         paths.append(request.out)
     first, second = paths
-    return chain(f"{instrument}, measured at {nm:g} nm", first, second, file, truth, reference)
+    return chain(f"{instrument}, measured at {nm:g} nm", first, second, file, truth=truth, reference=reference)
 
 
 def ratio_of_channels(air: Array, plate: Array) -> Array:
@@ -376,7 +383,8 @@ def two_starts(name: str, folder: Path, plates: Sequence[str] = PLATES[1:], by_d
     file = folder / f"{name}.yaml"
     file.write_text(dump_yaml(nominal), encoding="utf-8")
     air, other = (
-        emulated_capture(true, bench, m, kind, file, random) for m, kind in ((np.eye(4), "air"), (SAMPLE, "unknown"))
+        emulated_capture(true, bench, m, kind, file=file, random=random)
+        for m, kind in ((np.eye(4), "air"), (SAMPLE, "unknown"))
     )
     found, products = [], []
     for by in (0.0, by_deg):
@@ -405,6 +413,7 @@ def emulated_capture(
     bench: Bench,
     sample: Array,
     kind: str,
+    *,
     file: Path,
     random: np.random.Generator,
     wrong: Wrong | None = None,

@@ -88,6 +88,7 @@ def noisy_image(
     electrons: float,
     seed: int | list[int],
     w: np.ndarray | None = None,
+    *,
     darks: int = 0,
     read_noise_e: float = READ_NOISE_E,
 ) -> MuellerImage:

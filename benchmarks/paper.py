@@ -28,7 +28,7 @@ from paper_study.process import study_body, study_fault, study_sphere
 from processing.campaign.executors import executor
 
 
-def run(work: Path, out: Path, size: Size, pool: Executor, figure: Path | None = None) -> None:
+def run(work: Path, out: Path, size: Size, pool: Executor, *, figure: Path | None = None) -> None:
     """Take what is missing, process it and write the page; products of an earlier run are found again.
 
     `figure`: file for the deviations against Omega.
@@ -82,7 +82,7 @@ def main() -> None:
         size = QUICK
     out = given.out.resolve()
     with tempfile.TemporaryDirectory() as temporary, executor(1 if given.quick else given.workers) as pool:
-        run((given.work or Path(temporary)).resolve(), out, size, pool, given.figure)
+        run((given.work or Path(temporary)).resolve(), out, size, pool, figure=given.figure)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def one(
-    task: tuple[str, int, str], folder: Path, pixels: int, again: bool, oracle: bool, polarimeter: dict[str, Any]
+    task: tuple[str, int, str], folder: Path, pixels: int, again: bool, *, oracle: bool, polarimeter: dict[str, Any]
 ) -> dict[str, Any]:
     """Judge one bench as (group, seed, captures given); from its file if it was judged before."""
     from simulators.blind.bench_oracle import known_oracle
@@ -40,7 +40,7 @@ def one(
     if kept.exists() and not again:
         return dict(json.loads(kept.read_text(encoding="utf-8"))["judgement"])
     truth = next(read_truth(folder, name), None) or make_bench(
-        folder, seed, ROOT / "configs", group, pixels, Polarimeter(**polarimeter)
+        folder, seed, ROOT / "configs", group, pixels=pixels, polarimeter=Polarimeter(**polarimeter)
     )
     judgement, result = judge_bench(folder, truth, ROOT / "configs", given)
     if oracle:

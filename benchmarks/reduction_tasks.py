@@ -75,7 +75,7 @@ def write_frames(
     )
     frames = taken(shape, len(table))
     begin = time.perf_counter()
-    writer = CaptureWriter.create(path, header, table, shape, "2026-01-01T00:00:00+00:00")
+    writer = CaptureWriter.create(path, header, table, shape, start_time="2026-01-01T00:00:00+00:00")
     created = time.perf_counter()
     for n, pixels in enumerate(frames):
         turned = {axis: float(values[n]) for axis, values in table.angles_deg.items()}
@@ -226,7 +226,7 @@ def diagnose(folder: Path, target_ms: float, air: bool, moves: bool = False) -> 
     counts = digitize(bench, expose(bench, Scene(random, np.eye(4) if air else None), angles), random)
     sample = Sample(kind="air" if air else "unknown")
     path = folder / f"diagnose_{sample.kind}{'_moves' if moves else ''}.h5"
-    write_capture(path, bench, counts, angles, sample, INSTRUMENT.read_text(encoding="utf-8"))
+    write_capture(path, bench, counts, angles, sample=sample, instrument=INSTRUMENT.read_text(encoding="utf-8"))
     model = InstrumentModel.load(INSTRUMENT)
     name = f"diagnose, 40 x 600 x 600, all effects, all pixels, sample {sample.kind}{', image moves' if moves else ''}"
     return Task(name, target_ms, lambda: diagnose_captures([path], model), rounds=1)

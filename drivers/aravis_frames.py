@@ -22,7 +22,7 @@ def other_layout(arrival: Arrival, fmt: PixelFormat, size: tuple[int, int]) -> s
 
 
 def counts_of(
-    arrival: Arrival, fmt: PixelFormat, size: tuple[int, int], bits: int, shift: int, camera: str
+    arrival: Arrival, fmt: PixelFormat, size: tuple[int, int], bits: int, *, shift: int, camera: str
 ) -> NDArray[np.uint16]:
     """Counts (rows, columns) of a whole frame, right-aligned, in memory of their own, read-only.
 

@@ -131,7 +131,7 @@ class Setup:
         What the camera tells of its trigger and its exposure.
     """
 
-    def __init__(self, name: str, config: Config, aravis: Any, camera: Any, features: Features) -> None:
+    def __init__(self, name: str, config: Config, aravis: Any, camera: Any, *, features: Features) -> None:
         self._name = name
         self._config = config
         self._aravis = aravis

@@ -89,6 +89,7 @@ class MotionFailed(DeviceError):
         target_deg: float | None,
         last_deg: float | None,
         elapsed_s: float,
+        *,
         allowed_s: float,
         why: str,
         what_to_do: str = "The axis was sent a stop. Look at the axis before you move it again",

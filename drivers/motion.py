@@ -129,7 +129,7 @@ class Motion:
             self._result = self._last
             axis._do_note_rest(self._last.counts)
         elif axis._stops != self._stops_before:
-            raise MotionStopped(*self._figures(), "stopped on request", "Start a new move when it is safe")
+            raise self._failed(MotionStopped, "stopped on request", what_to_do="Start a new move when it is safe")
         elif self._idle_since_s is None:
             self._idle_since_s = now_s
         elif now_s - self._idle_since_s > SETTLE_S:
@@ -145,10 +145,10 @@ class Motion:
         elif self.target_deg is not None and now_s - self._progress_s > stall_s:
             raise self._stop_and_describe(f"stalled: it says it moves but made no progress for {stall_s:.2f} s")
 
-    def _figures(self) -> tuple[str, float | None, float | None, float, float]:
+    def _failed(self, kind: type[MotionFailed], why: str, **more: str) -> MotionFailed:
         elapsed_s = self.axis.clock.now_s() - self._start_s
         last_deg = None if self._last is None else self._last.deg
-        return self.axis.name, self.target_deg, last_deg, elapsed_s, self.allowed_s
+        return kind(self.axis.name, self.target_deg, last_deg, elapsed_s, allowed_s=self.allowed_s, why=why, **more)
 
     def _stop_and_describe(self, why: str) -> MotionFailed:
         """Stop the axis, then say what happened; a stop that fails as well is part of the message."""
@@ -156,7 +156,7 @@ class Motion:
             self.axis.stop()
         except DeviceError as error:
             why = f"{why}; and the stop failed too ({error})"
-        return MotionFailed(*self._figures(), why)
+        return self._failed(MotionFailed, why)
 
 
 class MotionAxis(ABC):

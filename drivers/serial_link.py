@@ -106,7 +106,7 @@ class SerialLink:
         self._framer = framer
         self._buffer = bytearray()
         self._transcript = transcript
-        self._serial: Any = open_port(port, baudrate, held_by, xonxoff, rtscts, two_stop_bits)
+        self._serial: Any = open_port(port, baudrate, held_by, xonxoff, rtscts=rtscts, two_stop_bits=two_stop_bits)
         self.purge(0.0)
 
     def write(self, data: bytes) -> None:

@@ -76,7 +76,9 @@ def held_descriptor(port: str) -> int:
     return int(port.removeprefix(HELD).partition("/")[0])
 
 
-def open_port(port: str, baudrate: int, held_by: str | None, xonxoff: bool, rtscts: bool, two_stop_bits: bool) -> Any:
+def open_port(
+    port: str, baudrate: int, held_by: str | None, xonxoff: bool, *, rtscts: bool, two_stop_bits: bool
+) -> Any:
     """Open a port or an address as pyserial knows them; the port alone, and for this program alone.
 
     Raises

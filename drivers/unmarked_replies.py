@@ -17,6 +17,7 @@ def ask(
     question: bytes,
     read: Callable[[bytes], T | None],
     reply_s: float,
+    *,
     asked: str,
     what_to_check: str,
     tries: int = 2,

@@ -16,7 +16,9 @@ folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 instrument = InstrumentModel.load(CONFIGS / "instruments/rgb950.yaml")
 scene = Scene.load(CONFIGS / "scenes/red_sphere.yaml")
 undeclared = (AngleOffset(axis="psg", offset_deg=0.5),)
-bench = SimulatedBench(scene, instrument.at(662), 662, 100, 100, flux_e_per_s=8e5, seed=2, effects=undeclared)
+bench = SimulatedBench(
+    scene, instrument.at(662), 662, rows=100, columns=100, flux_e_per_s=8e5, seed=2, effects=undeclared
+)
 write_virtual_capture(folder / "bent.h5", bench, instrument, omega_deg=35)
 
 judged, _ = diagnose_captures([folder / "bent.h5"], instrument)

@@ -12,7 +12,7 @@ from processing import InstrumentModel, Reduction, Xi0, open_dataset
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 instrument = InstrumentModel.load(CONFIGS / "instruments/rgb950.yaml")
 scene = Scene.load(CONFIGS / "scenes/red_sphere.yaml")
-bench = SimulatedBench(scene, instrument.at(662), 662, 100, 100, flux_e_per_s=8e5, seed=1)
+bench = SimulatedBench(scene, instrument.at(662), 662, rows=100, columns=100, flux_e_per_s=8e5, seed=1)
 write_virtual_capture(folder / "sphere.h5", bench, instrument, omega_deg=35)
 mueller = Reduction(folder / "sphere.h5").make(overwrite=True)
 xi0 = open_dataset(Xi0(mueller).make(overwrite=True))

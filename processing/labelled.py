@@ -221,7 +221,7 @@ def write_dataset(dataset: xr.Dataset, path: Path | str) -> Path:
 
     with h5py.File(path, "x") as h5:
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        create_layout(h5, header, angles, role, counts.shape[2:], counts.dtype, now)
+        create_layout(h5, header, angles, role, frame_shape=counts.shape[2:], dtype=counts.dtype, start_time=now)
         h5["entry/instrument/detector/data"][...] = counts
         for axis, values in angles.items():
             h5[f"entry/instrument/{axis}/value"][...] = values

@@ -28,6 +28,7 @@ def serve(
     model: Annotated[str | None, typer.Option(help="model that it says it is")] = None,
     axes: Annotated[int | None, typer.Option(min=1, max=16, help="number of devices, modules or axes")] = None,
     limits: Annotated[str | None, typer.Option(help="travel of every axis as MIN:MAX in degrees")] = None,
+    *,
     speed: Annotated[float, typer.Option(min=1e-3, help="deg/s")] = 300.0,
     acceleration: Annotated[float, typer.Option(min=1e-3, help="deg/s^2")] = 1500.0,
     homed: Annotated[bool, typer.Option("--homed", help="start with a reference, at angle zero")] = False,
@@ -83,6 +84,7 @@ def rig(
     out: Annotated[Path, typer.Option(help="rig file to write, with device paths in place of sim: ports")],
     sample: Annotated[str, typer.Option(help="what stands at the centre")] = "red_sphere",
     mode: Annotated[str, typer.Option(help="drr or stokes")] = "drr",
+    *,
     wavelength: Annotated[float, typer.Option(help="nm")] = 662,
     omega: Annotated[float, typer.Option(help="arm angle to prepare for, degrees")] = 35,
 ) -> None:
@@ -92,7 +94,10 @@ def rig(
     from simulators.rig import served_rig
 
     try:
-        with _signalled() as ended, served_rig.serve(rig_file, out, sample, mode, wavelength, omega):
+        with (
+            _signalled() as ended,
+            served_rig.serve(rig_file, out, sample, mode, wavelength_nm=wavelength, omega_deg=omega),
+        ):
             typer.echo(out)
             sys.stdout.flush()
             ended.wait()

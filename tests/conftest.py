@@ -225,7 +225,15 @@ class SyntheticCapture:
         with h5py.File(path, "w") as h5:
             record = CaptureHeader.model_validate(defaults | header)
             roles = role or ("sample",) * len(frames)
-            create_layout(h5, record, angles_deg, roles, frames.shape[2:], frames.dtype, "2026-01-01T00:00:00+00:00")
+            create_layout(
+                h5,
+                record,
+                angles_deg,
+                roles,
+                frame_shape=frames.shape[2:],
+                dtype=frames.dtype,
+                start_time="2026-01-01T00:00:00+00:00",
+            )
             h5["entry/instrument/detector/data"][...] = frames
             for axis, values in angles_deg.items():
                 h5[f"entry/instrument/{axis}/value"][...] = values

@@ -119,7 +119,7 @@ def read_campaign(folder: Path, library: Library, running: str | None = None) ->
     index, plans = read_index(folder), identity.get("plan", {})
     entries = {name: _entry(folder / name, library) for name in plans}
     cells = {
-        name: _cell(number, name, plan, index.get(name, {}), entries[name], name == running)
+        name: _cell(number, name, plan, index.get(name, {}), entry=entries[name], running=name == running)
         for number, (name, plan) in enumerate(plans.items(), 1)
     }
     events = list(_events(folder / LOG))
@@ -142,7 +142,7 @@ def _entry(path: Path, library: Library) -> Entry | None:
 
 
 def _cell(
-    number: int, name: str, plan: dict[str, Any], index: dict[str, Any], entry: Entry | None, running: bool
+    number: int, name: str, plan: dict[str, Any], index: dict[str, Any], *, entry: Entry | None, running: bool
 ) -> Cell:
     status, told = "missing", ""
     if running:

@@ -178,7 +178,7 @@ class Diagnoses:
         if isinstance(story.diagnosis, SurfaceDiagnosis):
             material = load_reflectance(folder / "material.yaml")
             view = ViewingGeometry.load(folder / "geometry.yaml")
-            written = write_surface(path, story.diagnosis, material, view, model, note)
+            written = write_surface(path, story.diagnosis, material, view, instrument=model, note=note)
         else:
             write_instrument(path, model, story.diagnosis, note)
             written = [path]

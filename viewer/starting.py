@@ -129,7 +129,7 @@ def _diagnose(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
     captures = [library.path(name) for name in asked.get("files", "").split("\n") if name]
     name, folder = Diagnoses(library).begin(captures, _instrument(library, asked))
     more = ["--residuals", str(folder / "residuals.npz")]
-    return _diagnosis(library, jobs, captures, name, folder, more)
+    return _diagnosis(library, jobs, captures, name, folder=folder, more=more)
 
 
 def _surface(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
@@ -138,10 +138,10 @@ def _surface(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
     geometry = _chosen(geometry_files(library), asked.get("geometry", ""), "geometry")
     name, folder = Diagnoses(library).begin(captures, _instrument(library, asked), (material, geometry))
     more = ["--reflectance", str(folder / "material.yaml"), "--geometry", str(folder / "geometry.yaml")]
-    return _diagnosis(library, jobs, captures, name, folder, more)
+    return _diagnosis(library, jobs, captures, name, folder=folder, more=more)
 
 
-def _diagnosis(library: Library, jobs: Jobs, captures: list[Path], name: str, folder: Path, more: list[str]) -> Job:
+def _diagnosis(library: Library, jobs: Jobs, captures: list[Path], name: str, *, folder: Path, more: list[str]) -> Job:
     command = ["diagnose", *map(str, captures), "--instrument", str(folder / "instrument.yaml")]
     command += ["--json", str(folder / "diagnosis.json"), "--report", str(folder / "report.html"), *more]
     about = {"diagnosis": name, "file": library.name(captures[0])}

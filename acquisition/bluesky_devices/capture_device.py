@@ -52,8 +52,8 @@ class CaptureDevice(Device):
         rig: Rig,
         turn: threading.Lock,
         plan: MeasurementPlan,
-        folder: Path | str,
         *,
+        folder: Path | str,
         home: bool,
         arm: AxisDevice | None,
     ) -> None:
@@ -140,7 +140,7 @@ class CaptureDevice(Device):
     def _run(self, run: Callable[..., Result], job: Job, path: Path) -> Result:
         refuse_failed(check_with_devices(job, self.rig, path.parent))
         try:
-            return run(job, self.rig, path, self._stop, (), self._home)
+            return run(job, self.rig, path, self._stop, home=self._home)
         except BaseException:
             # What is there already is gone on with, should the plan be run again.
             partial = path if path.name.endswith(PARTIAL) else path.with_name(path.name + PARTIAL)

@@ -107,6 +107,7 @@ class CampaignRun:
         rig: RigConfig,
         folder: CampaignFolder,
         operator: Operator,
+        *,
         stop: StopRequest,
         observers: Sequence[Observer] = (),
         home: bool = False,
@@ -223,9 +224,9 @@ class CampaignRun:
         if partial is not None:
             job = on_disc(f"read {partial}", job_of, partial, self.config, capture.plan)
             refuse_failed(check_with_devices(job, rig, final.parent))
-            return session.resume(job, rig, partial, self.stop, self.observers, self.home)
+            return session.resume(job, rig, partial, self.stop, observers=self.observers, home=self.home)
         refuse_failed(check_with_devices(job, rig, final.parent))
-        return session.take(job, rig, final, self.stop, self.observers, self.home)
+        return session.take(job, rig, final, self.stop, observers=self.observers, home=self.home)
 
     def _complete(self, capture: CampaignCapture, job: Job) -> bool:
         """Whether a capture is there, whole, and of this campaign. Raises Differs."""

@@ -49,6 +49,7 @@ def find_exposure(
     table: StateTable,
     poses_deg: Sequence[Pose],
     instrument: InstrumentModel,
+    *,
     sample: str,
     auto: AutoExposure,
     observers: Sequence[Observer],

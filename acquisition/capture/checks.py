@@ -181,9 +181,9 @@ def check_devices(
 
 
 def _check_first_move(table: StateTable, rig: Rig, state: int, here_deg: Mapping[str, float]) -> Check:
-    by = states_deg(turned(table, turns_to(table, rig, state, here_deg, {})))
-    if find_way(rig.config, here_deg, by[state], by, rig.limits, ARM) is None:
-        found = find_obstacle(rig.config, here_deg, {**here_deg, **by[state]}, by[state], rig.limits)
+    by = states_deg(turned(table, turns_to(table, rig, state, here_deg, wanted={})))
+    if find_way(rig.config, here_deg, by[state], by, limits=rig.limits, first=ARM) is None:
+        found = find_obstacle(rig.config, here_deg, {**here_deg, **by[state]}, by[state], limits=rig.limits)
         return Check("first move", False, f"to state {state} it meets {found}, and there is no way round it")
     return Check("first move", True, f"free to state {state}")
 

@@ -46,6 +46,7 @@ class FrameChecks:
         rows: Array | None,
         lit_darks: LitDarks,
         warn: Callable[[str], None],
+        *,
         before: NDArray[np.generic] | None = None,
     ) -> None:
         self._black, self._warn, self._lit_darks = black, warn, lit_darks
@@ -88,6 +89,7 @@ class FrameChecks:
         role: str,
         positions: dict[str, Position],
         exposure_s: float,
+        *,
         frame: Frame,
         full_scale: int,
     ) -> StateReport:

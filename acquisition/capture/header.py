@@ -17,7 +17,7 @@ from processing.yaml_file import dump_yaml
 
 
 def capture_header(
-    plan: MeasurementPlan, config: RigConfig, instrument: InstrumentModel, rig: Rig, seed: int | None
+    plan: MeasurementPlan, config: RigConfig, instrument: InstrumentModel, rig: Rig, *, seed: int | None
 ) -> CaptureHeader:
     """The header of a capture that is about to start, with settings and devices as read back."""
     camera = rig.require_camera()

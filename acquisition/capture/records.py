@@ -39,7 +39,7 @@ def _user() -> str:
 
 
 def end_record(
-    runner: CaptureRunner, rig: Rig, number: int, status: str, failure: BaseException | None
+    runner: CaptureRunner, rig: Rig, number: int, status: str, *, failure: BaseException | None
 ) -> dict[str, Any]:
     """What became of the run."""
     record: dict[str, Any] = {

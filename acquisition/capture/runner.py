@@ -82,6 +82,7 @@ class CaptureRunner:
         table: StateTable,
         writer: CaptureWriter,
         detector: Detector,
+        *,
         stop: StopRequest,
         observers: Sequence[Observer] = (),
         continue_after_interlock: bool = False,
@@ -110,7 +111,7 @@ class CaptureRunner:
         self._saturation_limit = saturation_limit
         lights = sum(role != "dark" for role in table.role)
         lit_darks = lit_darks or LitDarks(detector.black_level_counts, mosaic=mosaic, lights=lights)
-        self.checks = FrameChecks(detector.black_level_counts, rows, lit_darks, self.warn, rig.last_frame)
+        self.checks = FrameChecks(detector.black_level_counts, rows, lit_darks, self.warn, before=rig.last_frame)
         self._wall_clock = WallClock()
         self._rested: dict[str, Position] = {}
 
@@ -178,7 +179,14 @@ class CaptureRunner:
                 # What was seen while the light was shut from outside does not count.
                 losses = self.rig.light_losses()
                 found_s = find_exposure(
-                    self.rig, self.table, self.poses_deg, instrument, sample, auto, self.observers, self.warn
+                    self.rig,
+                    self.table,
+                    self.poses_deg,
+                    instrument,
+                    sample=sample,
+                    auto=auto,
+                    observers=self.observers,
+                    warn=self.warn,
                 )
         self._light = None
         self._scale_exposure(found_s / auto.start_s)
@@ -290,7 +298,9 @@ class CaptureRunner:
                 self._again(exposed.state, error)
                 return
         role, full_scale = self.table.role[exposed.state], self.rig.require_camera().full_scale
-        report = self.checks.report(exposed.state, role, exposed.positions, exposed.exposure_s, frame, full_scale)
+        report = self.checks.report(
+            exposed.state, role, exposed.positions, exposed.exposure_s, frame=frame, full_scale=full_scale
+        )
         # In a bracket the longer exposures are meant to saturate.
         shortest = self.table.exposure_s[exposed.state] <= 1.001 * self.table.exposure_s.min()
         if self._saturation_limit is not None and shortest and report.saturated_fraction > self._saturation_limit:

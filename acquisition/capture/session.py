@@ -43,6 +43,7 @@ def take(
     rig: Rig,
     path: Path,
     stop: StopRequest,
+    *,
     observers: Sequence[Observer] = (),
     home: bool = False,
 ) -> Result:
@@ -60,16 +61,18 @@ def take(
         table=unwound(folded(job.table, rig), rig),
         instrument=seen_by_camera(job.instrument, rig.require_camera()),
     )
-    header = capture_header(job.plan, job.rig, job.instrument, rig, job.seed)
+    header = capture_header(job.plan, job.rig, job.instrument, rig, seed=job.seed)
     begin = begin_record(job, rig, 0)
-    writer = CaptureWriter.create(path, header, job.table, frame_shape(rig), now(), begin, rig.clock)
+    writer = CaptureWriter.create(
+        path, header, job.table, frame_shape(rig), start_time=now(), begin=begin, clock=rig.clock
+    )
     if not job.exposure_known:
         writer.set_exposure(np.full(len(job.table), np.nan))
-    return _run(job, rig, writer, range(len(job.table)), stop, observers, None)
+    return _run(job, rig, writer, range(len(job.table)), stop=stop, observers=observers, earlier=None)
 
 
 def resume(
-    job: Job, rig: Rig, partial: Path, stop: StopRequest, observers: Sequence[Observer] = (), home: bool = False
+    job: Job, rig: Rig, partial: Path, stop: StopRequest, *, observers: Sequence[Observer] = (), home: bool = False
 ) -> Result:
     """Go on with a capture: the first state not done, then the others, as a new segment of it. Raises as `take`.
 
@@ -83,11 +86,11 @@ def resume(
     job = replace(job, instrument=seen_by_camera(job.instrument, rig.require_camera()))
     lights = sum(role != "dark" for role in job.table.role)
     earlier = on_disc(
-        f"read {partial}", _earlier, partial, frame_shape(rig), job.instrument.mosaic, devices_of(rig), lights
+        f"read {partial}", _earlier, partial, frame_shape(rig), job.instrument.mosaic, devices_of(rig), lights=lights
     )
     writer = CaptureWriter(on_disc(f"rename {partial}", as_partial, partial), rig.clock)
     pending = [k for k in range(len(job.table)) if k not in earlier.done]
-    return _run(job, rig, writer, pending, stop, observers, earlier)
+    return _run(job, rig, writer, pending, stop=stop, observers=observers, earlier=earlier)
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,7 @@ def _earlier(
     shape: tuple[int, int],
     mosaic: Mosaic | None,
     devices: tuple[dict[str, Any], dict[str, Any]],
+    *,
     lights: int,
 ) -> Earlier:
     with Capture(partial) as capture:
@@ -142,6 +146,7 @@ def _run(
     rig: Rig,
     writer: CaptureWriter,
     pending: Sequence[int],
+    *,
     stop: StopRequest,
     observers: Sequence[Observer],
     earlier: Earlier | None,
@@ -154,14 +159,14 @@ def _run(
         job.table,
         writer,
         job.rig.detector,
-        stop,
-        watchers,
+        stop=stop,
+        observers=watchers,
         continue_after_interlock=job.plan.continue_after_interlock,
         saturation_limit=1 - auto.percentile / 100 if isinstance(auto, AutoExposure) else None,
         mosaic=job.instrument.mosaic is not None,
         lit_darks=None if earlier is None else earlier.darks,
         rows=_rows(job),
-        turns={} if earlier is None else turns_to(job.table, rig, first, rig.where_once_homed(), {}),
+        turns={} if earlier is None else turns_to(job.table, rig, first, rig.where_once_homed(), wanted={}),
     )
     status: Status = "failed"
     failure: BaseException | None = None
@@ -288,7 +293,7 @@ def _end_segment(
 ) -> tuple[dict[str, Any], Path]:
     """Write what became of the run, and seal the file. Returns the closing record and the file."""
     writer = runner.writer
-    end = end_record(runner, rig, writer.segment, status, failure)
+    end = end_record(runner, rig, writer.segment, status, failure=failure)
     closing = closing_record([], end)
     try:
         writer.settle(in_haste=failure is not None)

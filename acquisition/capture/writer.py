@@ -120,6 +120,7 @@ class CaptureWriter:
         header: CaptureHeader,
         table: StateTable,
         frame_shape: tuple[int, int],
+        *,
         start_time: str,
         begin: Mapping[str, Any] | None = None,
         clock: Clock = REAL,
@@ -135,7 +136,10 @@ class CaptureWriter:
         AcquisitionError
             The file exists, the folder cannot be written, or the disc has not enough room.
         """
-        return cls(on_disc(f"create {path}", _create, path, header, table, frame_shape, start_time, begin), clock)
+        return cls(
+            on_disc(f"create {path}", _create, path, header, table, frame_shape, start_time=start_time, begin=begin),
+            clock,
+        )
 
     def put(self, record: StateRecord) -> None:
         """Hand over a state, when the one before is on the disc. Raises AcquisitionError after DEAD_S."""
@@ -279,6 +283,7 @@ def _create(
     header: CaptureHeader,
     table: StateTable,
     frame_shape: tuple[int, int],
+    *,
     start_time: str,
     begin: Mapping[str, Any] | None,
 ) -> Path:
@@ -291,7 +296,15 @@ def _create(
         raise AcquisitionError(f"{path if path.exists() else partial} exists already; nothing was changed")
 
     def make(h5: h5py.File) -> None:
-        create_layout(h5, header, dict(table.angles_deg), table.role, frame_shape, np.uint16, start_time)
+        create_layout(
+            h5,
+            header,
+            dict(table.angles_deg),
+            table.role,
+            frame_shape=frame_shape,
+            dtype=np.uint16,
+            start_time=start_time,
+        )
         h5["entry/states/exposure_s"][...] = table.exposure_s
         h5["entry/states/repeats"][...] = table.repeats
 
@@ -329,11 +342,12 @@ def _write_state(
     state: int,
     positions: Mapping[str, tuple[float, float]],
     columns: Mapping[str, Any],
-    pixels: NDArray[Any],
+    *,
+    frame: NDArray[Any],
 ) -> None:
     file = _files[path]
     file.require_at(path)
-    file.write_state(state, pixels, positions, columns)
+    file.write_state(state, frame, positions, columns)
 
 
 def finish(partial: Path) -> Path:

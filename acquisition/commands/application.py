@@ -31,6 +31,7 @@ def capture(
     omega: Omega = None,
     mode: ModeName = None,
     wavelength: Wavelength = None,
+    *,
     sample: Annotated[str | None, typer.Option(help="name of the sample; air and mirror are known samples")] = None,
     exposure: Annotated[float | None, typer.Option(help="seconds")] = None,
     rig: RigFile = None,

@@ -143,6 +143,7 @@ def snap(
     out: Annotated[Path, typer.Option(help=".png (8 bits, stretched), .tif or .npy (counts)")] = Path("snap.png"),
     rig: RigFile = None,
     light: Annotated[bool, typer.Option("--light/--dark", help="let light through for it")] = True,
+    *,
     wavelength: Annotated[float | None, typer.Option(help="nm, for a source that selects it")] = None,
     sample: Annotated[str, typer.Option(help="what the simulated rig shows")] = "red_sphere",
 ) -> None:
@@ -152,7 +153,7 @@ def snap(
 
     config = _load(rig)
     with StopRequest(patience=1):
-        typer.echo(take_frame(config, exposure, out, light, sample, wavelength))
+        typer.echo(take_frame(config, exposure, out, light, sample=sample, wavelength_nm=wavelength))
 
 
 def acknowledge() -> None:

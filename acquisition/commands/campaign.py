@@ -76,7 +76,9 @@ def _run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Ob
         ):
             watchers = [ConsoleProgress(console), told, notifier, *page, *observers]
             try:
-                done = CampaignRun(campaign, rig_config, held, operator, stop, watchers, options.home).run(jobs)
+                done = CampaignRun(
+                    campaign, rig_config, held, operator, stop=stop, observers=watchers, home=options.home
+                ).run(jobs)
             finally:
                 lines = _sum_up(held, [capture.name for capture, _ in jobs])
             notifier.tell("end", lines[0] if done else f"stopped: {lines[0]}", summary=lines)

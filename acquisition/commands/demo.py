@@ -50,7 +50,13 @@ def demo(
         console.print(line, style="green" if line.startswith("./lab") else "", markup=False)
 
     result = run_seed(
-        folder, seed, faults, only or (), say, lambda: progress_line("diagnose", verbose=False), [ConsoleProgress(err)]
+        folder,
+        seed,
+        faults,
+        only or (),
+        say=say,
+        progress=lambda: progress_line("diagnose", verbose=False),
+        observers=[ConsoleProgress(err)],
     )
     console.print()
     show(result.judged.diagnosis, written=True)
@@ -70,6 +76,7 @@ def run_seed(
     seed: int,
     faults: int = 2,
     only: Sequence[str] = (),
+    *,
     say: Say = lambda line: None,
     progress: Callable[[], AbstractContextManager[Say]] = lambda: nullcontext(lambda step: None),
     observers: Sequence[Observer] = (),
@@ -84,4 +91,4 @@ def run_seed(
     smaller = rig.simulator.model_copy(update={"rows": SIDE, "columns": SIDE})
     plan = MeasurementPlan.load(CONFIGS / "plans" / "drr.yaml")
     rig = rig.model_copy(update={"simulator": smaller})
-    return run_demo(rig, plan, folder, seed, faults, only, say, progress, observers)
+    return run_demo(rig, plan, folder, seed, count=faults, only=only, say=say, progress=progress, observers=observers)

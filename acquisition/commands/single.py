@@ -110,7 +110,8 @@ def _run(options: Options, stop: StopRequest) -> int:
             live_page(options.live, job.rig, stop, console) as page,
             told,
         ):
-            result = take(job, rig, path, stop, [ConsoleProgress(console), told, notifier, *page], home=options.home)
+            observers = [ConsoleProgress(console), told, notifier, *page]
+            result = take(job, rig, path, stop, observers=observers, home=options.home)
             notifier.tell("end", f"{path.name}: {result.states_done} of {result.states} states, {result.status}")
     summarize(job, result)
     return INTERRUPTED if result.status == "aborted" else 0

@@ -21,7 +21,7 @@ PICTURE, COUNTS = ".png", (".tif", ".tiff", ".npy")
 
 
 def take_frame(
-    config: RigConfig, exposure_s: float, out: Path, light: bool, sample: str, wavelength_nm: float | None = None
+    config: RigConfig, exposure_s: float, out: Path, light: bool, *, sample: str, wavelength_nm: float | None = None
 ) -> str:
     """Write one frame to `out` and describe it; light is on or off afterwards as it was found.
 

@@ -78,6 +78,7 @@ def run_demo(
     plan: MeasurementPlan,
     folder: Path,
     seed: int,
+    *,
     count: int = 2,
     only: Sequence[str] = (),
     say: Say = lambda line: None,

@@ -65,7 +65,7 @@ def find_clash(solids: Solids, ranges_deg: Ranges) -> Clash | None:
     """
     for first, second in _pairs(solids):
         (low_1, high_1), (low_2, high_2) = (_range_of(solid, ranges_deg) for solid in (first, second))
-        angle_deg = _first_clash_deg(first, second, low_1 - high_2, high_1 - low_2, solids.margin_mm)
+        angle_deg = _first_clash_deg(first, second, low_1 - high_2, high_1 - low_2, margin_mm=solids.margin_mm)
         if angle_deg is not None:
             return Clash(first, second, angle_deg)
     return None
@@ -96,7 +96,7 @@ def _range_of(solid: Solid, ranges_deg: Ranges) -> tuple[float, float]:
 
 
 @cache
-def _first_clash_deg(first: Solid, second: Solid, low_deg: float, high_deg: float, margin_mm: float) -> float | None:
+def _first_clash_deg(first: Solid, second: Solid, low_deg: float, high_deg: float, *, margin_mm: float) -> float | None:
     a, b = footprint(first), footprint(second)
     if max(a.low_mm, b.low_mm) - min(a.high_mm, b.high_mm) >= margin_mm:
         return None

@@ -34,7 +34,7 @@ def unwound(table: StateTable, rig: Rig, here_deg: Mapping[str, float] | None = 
             turns = math.ceil((here[name] - 1e-3 - float(table.angles_deg[name].min())) / 360.0)
             if turns > 0 and here[name] < UP_TO_DEG:
                 ahead[name] = turns
-    return turned(table, turns_to(table, rig, 0, here, ahead))
+    return turned(table, turns_to(table, rig, 0, here, wanted=ahead))
 
 
 def turned(table: StateTable, turns: Mapping[str, int]) -> StateTable:
@@ -44,7 +44,7 @@ def turned(table: StateTable, turns: Mapping[str, int]) -> StateTable:
 
 
 def turns_to(
-    table: StateTable, rig: Rig, state: int, here_deg: Mapping[str, float], wanted: Mapping[str, int]
+    table: StateTable, rig: Rig, state: int, here_deg: Mapping[str, float], *, wanted: Mapping[str, int]
 ) -> dict[str, int]:
     """Whole turns to add to the endless axes of a table, so that the way to one of its states is free.
 
@@ -60,7 +60,7 @@ def turns_to(
     for chosen in product(*choices):
         turns = dict(zip(names, chosen, strict=True))
         by = states_deg(turned(table, turns))
-        if find_way(rig.config, here_deg, by[state], by, rig.limits) is not None:
+        if find_way(rig.config, here_deg, by[state], by, limits=rig.limits) is not None:
             return turns
     return dict(wanted)
 

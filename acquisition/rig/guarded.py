@@ -59,6 +59,7 @@ class Guarding:
         journal: Path | None,
         ports: dict[str, int],
         shut: Callable[[], None],
+        *,
         tell: Callable[[str], None],
     ) -> None:
         self._config, self._journal, self._ports = config, journal, ports

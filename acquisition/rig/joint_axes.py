@@ -82,7 +82,7 @@ class JointAxes:
         AcquisitionError
             There is no such way; nothing was moved.
         """
-        way = find_way(self.config, self.where_known(), targets_deg, by, self.limits, first)
+        way = find_way(self.config, self.where_known(), targets_deg, by, limits=self.limits, first=first)
         if way is None:
             # Says what is met.
             self._check_way(targets_deg)
@@ -126,7 +126,7 @@ class JointAxes:
             # Not even a position is read then: most moves are of rotators that nothing can hit.
             return None
         here = self.where_known()
-        return find_obstacle(self.config, here, here | dict(targets_deg), targets_deg, self.limits)
+        return find_obstacle(self.config, here, here | dict(targets_deg), targets_deg, limits=self.limits)
 
     @property
     def limits(self) -> dict[str, Limits]:

@@ -196,7 +196,7 @@ class Rig(JointAxes):
                         f"{journal} cannot be written ({error.strerror}). Remove it, or give another folder with --out."
                     ) from error
             self._guarding = Guarding(
-                self.config, journal, self._lines.descriptors(), self._shut_at_once, self._guard_says
+                self.config, journal, self._lines.descriptors(), self._shut_at_once, tell=self._guard_says
             )
 
     def _guard_says(self, text: str) -> None:

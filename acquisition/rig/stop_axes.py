@@ -46,7 +46,7 @@ def stop_axes(config: RigConfig, tell: Tell, let_go: Collection[int] = ()) -> bo
         lines.setdefault(os.path.realpath(entry.port), {})[name] = entry
     told = set(let_go) or _tell_running(list(lines), tell)
     with LineRegistry(clock=clock_of(config)) as registry, ThreadPoolExecutor(max(1, len(lines))) as threads:
-        stopped = threads.map(lambda port: _stop_line(port, lines[port], registry, told, tell), lines)
+        stopped = threads.map(lambda port: _stop_line(port, lines[port], registry, told, tell=tell), lines)
         return all(list(stopped))
 
 
@@ -80,7 +80,9 @@ def _is_acquire(pid: int) -> bool:
     return any(Path(word).name == "acquire" for word in words[:2]) or "acquisition.commands.application" in words[:3]
 
 
-def _stop_line(port: str, entries: Mapping[str, AxisConfig], lines: LineRegistry, told: set[int], tell: Tell) -> bool:
+def _stop_line(
+    port: str, entries: Mapping[str, AxisConfig], lines: LineRegistry, told: set[int], *, tell: Tell
+) -> bool:
     _wait_let_go(port, told)
     axes = []
     busy: dict[str, AxisConfig] = {}

@@ -28,6 +28,7 @@ def find_obstacle(
     start_deg: Pose,
     end_deg: Pose,
     moving: Iterable[str] | None = None,
+    *,
     limits: Mapping[str, Limits] | None = None,
 ) -> str | None:
     """What a move meets anywhere on its way, in words; None if the way is free.
@@ -57,6 +58,7 @@ def find_way(
     start_deg: Pose,
     target_deg: Pose,
     by: Sequence[Pose] = (),
+    *,
     limits: Mapping[str, Limits] | None = None,
     first: str | None = None,
 ) -> list[dict[str, float]] | None:
@@ -79,7 +81,7 @@ def find_way(
         alone = {first: target_deg[first]}
         others = {name: angle for name, angle in target_deg.items() if name != first}
         both = ((places, alone), (places | alone, others))
-        if all(find_obstacle(rig, here, here | move, move, limits) is None for here, move in both):
+        if all(find_obstacle(rig, here, here | move, move, limits=limits) is None for here, move in both):
             return [alone, others]
     asked = [name for name in concerned(rig) if name in places]
     turning = [name for name in asked if abs(target_deg.get(name, places[name]) - places[name]) > EDGE_DEG]
@@ -98,7 +100,7 @@ def find_way(
         for node, pose in enumerate(nodes):
             if node not in came_from:
                 moving = [name for name in asked if pose[name] != here[name]]
-                if find_obstacle(rig, here, pose, moving, limits) is None:
+                if find_obstacle(rig, here, pose, moving, limits=limits) is None:
                     came_from[node] = from_node
                     reached.append(node)
                     if node == 0:

@@ -164,7 +164,7 @@ class Page:
         elif method != "GET":
             await _send(writer, 404, "text/plain", b"there is no such action")
         elif self._clients >= CLIENTS:
-            await _send(writer, 503, "text/plain", b"", "Retry-After: 1\r\n")
+            await _send(writer, 503, "text/plain", b"", more="Retry-After: 1\r\n")
         else:
             self._clients += 1
             try:
@@ -197,7 +197,7 @@ class Page:
         return 404, "text/plain", b"there is no such page"
 
 
-async def _send(writer: asyncio.StreamWriter, code: int, kind: str, body: bytes, more: str = "") -> None:
+async def _send(writer: asyncio.StreamWriter, code: int, kind: str, body: bytes, *, more: str = "") -> None:
     head = (
         f"HTTP/1.1 {code} {HTTPStatus(code).phrase}\r\nContent-Type: {kind}\r\nContent-Length: {len(body)}\r\n"
         "Cache-Control: no-store\r\nReferrer-Policy: no-referrer\r\nConnection: close\r\n"

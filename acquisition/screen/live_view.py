@@ -42,7 +42,7 @@ class LiveView(Observer):
     url : address of the page, with the token that everything on it needs.
     """
 
-    def __init__(self, simulated: bool, black: float, full_scale: int, stop: StopRequest, port: int = 0) -> None:
+    def __init__(self, simulated: bool, black: float, full_scale: int, stop: StopRequest, *, port: int = 0) -> None:
         self._stop = stop
         self._view: dict[str, Any] = {"title": "", "activity": "starting", "done": 0, "pending": 0, "status": "running"}
         self._messages: deque[str] = deque(maxlen=50)

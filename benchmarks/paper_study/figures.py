@@ -150,7 +150,7 @@ def lookup_tables(study: SphereStudy, nm: float, pixels: int) -> Shown:
     """xi0 of both instruments' tables on a virtual sphere, and the difference."""
     tables = [ScatteringTable.load(study.as_told.tables[kind, nm]) for kind in ("mueller", "stokes")]
     view = study.as_told.views["stokes"]
-    figure = tables_figure(tables[0], tables[1], view, SHOWN_DEG, (pixels, pixels))
+    figure = tables_figure(tables[0], tables[1], view, SHOWN_DEG, shape=(pixels, pixels))
     caption = f"xi0 through tables of one-degree bins, {nm:g} nm: Mueller, Stokes, difference (paper, Fig. 10)."
     return Shown(figure, caption)
 

@@ -33,6 +33,7 @@ def write_page(
     size: Size,
     sphere: SphereStudy,
     body: dict[float, BodyProducts],
+    *,
     fault: FaultStudy,
     seconds: dict[str, float],
 ) -> None:

@@ -111,7 +111,7 @@ def study_body(captures: Path) -> dict[float, BodyProducts]:
     return products
 
 
-def study_fault(captures: Path, out: Path, healthy: SphereStudy, pool: Executor, say: Say) -> FaultStudy:
+def study_fault(captures: Path, out: Path, healthy: SphereStudy, pool: Executor, *, say: Say) -> FaultStudy:
     """Compare as if nothing were wrong, ask `diagnose`, and compare again with the instrument file that it wrote."""
     say("sphere with the undeclared fault")
     before = Campaign(captures, out / "before", SPHERE, TABLE_I).run(pool)
@@ -149,7 +149,7 @@ def _xi0(faulty: CampaignResult, healthy: SphereStudy) -> dict[tuple[float, floa
             for path in (faulty.tables["mueller", row.wavelength_nm], stokes["stokes", row.wavelength_nm])
         ]
         view = healthy.as_told.views["stokes"]
-        compared = compare_on_sphere(tables[0], tables[1], view, row.omega_deg, shape)
+        compared = compare_on_sphere(tables[0], tables[1], view, row.omega_deg, shape=shape)
         found[row.wavelength_nm, row.omega_deg] = compared.get("xi0_percent", float("nan"))
     return found
 

@@ -101,7 +101,7 @@ class APTLine:
 
         asked = f"APT {self.link.port}, {REPLY_NAMES.get(reply_id, hex(reply_id))}"
         advice = "Is it an APT unit, and the only program on it? A frozen unit needs its power switched off and on"
-        return ask(self.link, request, data_of, self.reply_s, asked, advice)
+        return ask(self.link, request, data_of, self.reply_s, asked=asked, what_to_check=advice)
 
 
 class APTAxis(MotionAxis):

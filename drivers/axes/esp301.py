@@ -91,7 +91,9 @@ class ESP301Line:
         ReplyTimeout, ReplyError
         """
         asked, check = f"ESP301 {self.link.port}, {command}", "Check power, cable, baud rate and RTS/CTS"
-        return ask(self.link, f"{command}\r".encode("ascii"), text_of(form), self.reply_s, asked, check)
+        return ask(
+            self.link, f"{command}\r".encode("ascii"), text_of(form), self.reply_s, asked=asked, what_to_check=check
+        )
 
     def take_errors(self, axis: int) -> list[int]:
         """Empty the controller's error memory and return what concerns an axis, oldest first.

@@ -74,7 +74,14 @@ class GCS2Line:
         ReplyTimeout, ReplyError
         """
         asked = f"GCS2 {self.link.port}, {command!r}"
-        return ask(self.link, _bytes(command), text_of(form), self.reply_s, asked, "Check power, cable and baud rate")
+        return ask(
+            self.link,
+            _bytes(command),
+            text_of(form),
+            self.reply_s,
+            asked=asked,
+            what_to_check="Check power, cable and baud rate",
+        )
 
 
 def _bytes(command: str) -> bytes:

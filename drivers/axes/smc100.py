@@ -128,7 +128,9 @@ class SMC100Line:
         # Who sets a time asks again by itself.
         tries = 2 if reply_s is None else 1
         check = "Check power, cable, baud rate, address"
-        return ask(self.link, question, value_of, reply_s or self.reply_s, asked, check, tries)
+        return ask(
+            self.link, question, value_of, reply_s or self.reply_s, asked=asked, what_to_check=check, tries=tries
+        )
 
 
 _STATE = re.compile(r"[0-9A-Fa-f]{6}")

@@ -85,7 +85,14 @@ class XPSLine:
         """
         asked = f"XPS {self.link.port}, {call}"
         whole = text_of(re.compile(rf"0,{form}|{_ERROR}"))
-        answer = ask(self.link, call.encode("ascii"), whole, self.reply_s, asked, "Check power, cable and address")
+        answer = ask(
+            self.link,
+            call.encode("ascii"),
+            whole,
+            self.reply_s,
+            asked=asked,
+            what_to_check="Check power, cable and address",
+        )
         return _values(answer, asked)
 
     def command(self, call: str, reply_s: float | None = None) -> None:
@@ -116,7 +123,7 @@ class XPSAxis(MotionAxis):
     """One group with one positioner."""
 
     def __init__(
-        self, name: str, config: Config, line: XPSLine, lines: LineRegistry, moving: SerialLink, stopping: SerialLink
+        self, name: str, config: Config, line: XPSLine, lines: LineRegistry, *, moving: SerialLink, stopping: SerialLink
     ) -> None:
         super().__init__(name, config, lines.clock)
         self.config: Config = config
@@ -295,6 +302,6 @@ def open(name: str, config: Config, lines: LineRegistry) -> XPSAxis:
         for _ in range(2):
             own.append(SerialLink(config.port, 9600, framer, clock=lines.clock))
             failed.callback(own[-1].close)
-        axis = XPSAxis(name, config, line, lines, *own)
+        axis = XPSAxis(name, config, line, lines, moving=own[0], stopping=own[1])
         failed.pop_all()
         return axis

@@ -56,14 +56,14 @@ def open(name: str, config: Config, clock: Clock = REAL) -> AravisCamera:
     """
     aravis, glib_error = load_aravis()
     camera = open_camera(name, config.device, aravis, glib_error)
-    return AravisCamera(name, config, aravis, glib_error, camera, clock)
+    return AravisCamera(name, config, aravis, glib_error, camera=camera, clock=clock)
 
 
 class AravisCamera(Camera):
     """A camera opened by `open`."""
 
     def __init__(
-        self, name: str, config: Config, aravis: Any, glib_error: Any, camera: Any, clock: Clock = REAL
+        self, name: str, config: Config, aravis: Any, glib_error: Any, *, camera: Any, clock: Clock = REAL
     ) -> None:
         super().__init__(name, config.retakes)
         self._clock = clock
@@ -71,7 +71,7 @@ class AravisCamera(Camera):
         self._aravis = aravis
         self._camera = camera
         self._features = Features(name, aravis, glib_error, camera)
-        self._setup = Setup(name, config, aravis, camera, self._features)
+        self._setup = Setup(name, config, aravis, camera, features=self._features)
         self._glib_error = glib_error
         self._stream: FrameStream | None = None
         self._chunks: ChunkStamps | None = None
@@ -104,7 +104,13 @@ class AravisCamera(Camera):
         """Which camera this is and how it is connected."""
         self._require_open()
         return identify(
-            self._config, self._aravis, self._camera, self._features, self._setup, self._pixel_format(), self.bits
+            self._config,
+            self._aravis,
+            self._camera,
+            self._features,
+            setup=self._setup,
+            fmt=self._pixel_format(),
+            bits=self.bits,
         )
 
     def temperature_c(self) -> float | None:
@@ -331,7 +337,7 @@ class AravisCamera(Camera):
         fmt, size = self._pixel_format(), self._setup.size
         if wrong := other_layout(arrival, fmt, size):
             raise self._frame_lost(wrong)
-        pixels = counts_of(arrival, fmt, size, self.bits, self._config.shift, f"camera {self.name}")
+        pixels = counts_of(arrival, fmt, size, self.bits, shift=self._config.shift, camera=f"camera {self.name}")
         host_time_s = arrival.first_packet_s if self._setup.hardware else self._sent_unix_s
         time_ns = arrival.camera_time_ns if self._chunks is None else self._chunks.time_ns(arrival)
         return Frame(pixels, arrival.frame_id, time_ns, host_time_s)

@@ -179,6 +179,7 @@ def free_design(
     states: int,
     goal: Goal | None = None,
     free_retardances: bool = False,
+    *,
     first: Mapping[str, Array] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> FreeDesign:

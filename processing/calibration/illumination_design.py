@@ -71,6 +71,7 @@ def predict(
     model: ReflectanceModel,
     wavelength_nm: float,
     camera: InstrumentModel,
+    *,
     states: dict[str, Array],
     omega_deg: Sequence[float] = PAPER_OMEGA_DEG,
     assumptions: Assumptions | None = None,
@@ -92,7 +93,7 @@ def predict(
         image = view.at(omega, pixels, pixels)
         m0 = model.mueller_jones(image.points, wavelength_nm)
         for name, stokes in states.items():
-            columns[name].append(_summary(predicted(m0, image.points, analyzers, stokes, given)))
+            columns[name].append(_summary(predicted(m0, image.points, analyzers, stokes, given=given)))
         if progress:
             progress(done, len(omega_deg))
     found = []
@@ -103,7 +104,7 @@ def predict(
 
 
 def predicted(
-    m0: Array, points: ScatteringGeometry, analyzers: Array, stokes: Array, given: Assumptions
+    m0: Array, points: ScatteringGeometry, analyzers: Array, stokes: Array, *, given: Assumptions
 ) -> Xi0Estimate:
     """Estimate from noise-free intensities with the variance that noise would have: its standard errors count."""
     normal, source = points.normal, points.to_source

@@ -33,7 +33,7 @@ PLANES = {
 
 
 def fit_response(
-    capture: Capture, model: InstrumentModel, out: Path, step: Step, overwrite: bool = False
+    capture: Capture, model: InstrumentModel, out: Path, step: Step, *, overwrite: bool = False
 ) -> dict[str, Any]:
     """Fit the response of each raw pixel to light of known polarization; write a product "analyzers".
 
@@ -70,7 +70,7 @@ def fit_response(
         frames = reader.read(block)
         corrected = np.empty(frames.shape, np.float32)
         mask = np.zeros(frames.shape[2], np.uint8)
-        reader.load(frames, 0, frames.shape[2], corrected, mask)
+        reader.load(frames, 0, frames.shape[2], corrected, mask=mask)
         saturated += int(np.count_nonzero(mask & np.uint8(Mask.SATURATED)))
         signal: NDArray[np.float32] = corrected[:, 0, :]
         part = np.empty((LINEAR, frames.shape[2]), np.float32)
@@ -87,7 +87,9 @@ def fit_response(
         facts["warnings"].append(
             f"{saturated} of {rows * columns} pixels saturate in some state, and their response is wrong: expose less"
         )
-    with ProductWriter(out, "analyzers", capture.header, (rows, columns), PLANES, (step,), overwrite) as writer:
+    with ProductWriter(
+        out, "analyzers", capture.header, (rows, columns), planes=PLANES, steps=(step,), overwrite=overwrite
+    ) as writer:
         writer.write(slice(0, rows), response=response, residual_rms=residual)
         writer.seal(facts)
     return facts

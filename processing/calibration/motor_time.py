@@ -114,6 +114,7 @@ def front(
     states: int,
     speeds: Mapping[str, Speed],
     goal: Goal | None = None,
+    *,
     free_retardances: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Point]:

@@ -209,7 +209,9 @@ def write_camera(
             "integer": first.integer_counts,
             "warnings": _warnings(line, first),
         }
-        with ProductWriter(out, "camera", first.header, first.frame_shape, PLANES, (step,), overwrite) as writer:
+        with ProductWriter(
+            out, "camera", first.header, first.frame_shape, planes=PLANES, steps=(step,), overwrite=overwrite
+        ) as writer:
             mask = np.where(bad, np.uint8(Mask.BAD), np.uint8(0))
             mean = np.mean([d.mean(axis=0) for d in darks], axis=0).astype(np.float32)
             writer.write(slice(0, first.frame_shape[0]), dark_mean=mean, pixel_flags=mask)

@@ -178,7 +178,7 @@ def two_retarders(model: InstrumentModel) -> tuple[Retarder, Retarder]:
 
 
 def rows_of_design(
-    states: int, ratio: float, generator_rad: float, analyzer_rad: float, zeros_rad: tuple[float, float, float]
+    states: int, ratio: float, generator_rad: float, analyzer_rad: float, *, zeros_rad: tuple[float, float, float]
 ) -> Array:
     """W (states, 16) of ideal elements; zeros are those of the generator retarder, analyzer retarder and analyzer."""
     angle = 2 * np.pi / states * np.arange(states)
@@ -193,6 +193,7 @@ def optimize(
     noise: Noise,
     states: Sequence[int],
     free: Mapping[str, bool],
+    *,
     ratio: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Design]:
@@ -225,20 +226,22 @@ def optimize(
     for n in states:
         best = (np.inf, float(ratio), *fixed)
         for r in ratios:
-            best = min(best, _best_retardances(n, float(r), fixed, zeros, bool(free.get("retardances")), best[0]))
+            best = min(
+                best, _best_retardances(n, float(r), fixed, zeros, free=bool(free.get("retardances")), to_beat=best[0])
+            )
             done += 1
             if progress:
                 progress(done, total)
-        w = rows_of_design(n, best[1], best[2], best[3], zeros)
+        w = rows_of_design(n, best[1], best[2], best[3], zeros_rad=zeros)
         designs.append(Design(n, best[1], float(np.rad2deg(best[2])), float(np.rad2deg(best[3])), score(w, noise)))
     return designs
 
 
 def _best_retardances(
-    n: int, ratio: float, fixed: tuple[float, float], zeros: tuple[float, float, float], free: bool, to_beat: float
+    n: int, ratio: float, fixed: tuple[float, float], zeros: tuple[float, float, float], *, free: bool, to_beat: float
 ) -> tuple[float, float, float, float]:
     def cost(x: Array) -> float:
-        return equally_weighted_variance(rows_of_design(n, ratio, float(x[0]), float(x[1]), zeros))
+        return equally_weighted_variance(rows_of_design(n, ratio, float(x[0]), float(x[1]), zeros_rad=zeros))
 
     if not free:
         return cost(np.array(fixed)), ratio, *fixed

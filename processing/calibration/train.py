@@ -110,7 +110,9 @@ class CurveFit:
         """
         matrix = self.shared.matrix(wavelength_nm)
         nominal = model.model_copy(update={"calibrate": self.shared.names, "wavelengths_nm": None})
-        return _fitted(self.shared, nominal.nominal_at(wavelength_nm), matrix, self.searched, self.covariance)
+        return _fitted(
+            self.shared, nominal.nominal_at(wavelength_nm), matrix, self.searched, covariance=self.covariance
+        )
 
 
 def fit_trains(parts: Sequence[Part], free: Sequence[str]) -> list[Calibration]:
@@ -286,7 +288,7 @@ class _Fit:
         covariance = self.covariance(found)
         out = []
         for part, matrix in zip(self.parts, self._matrices, strict=True):
-            fitted = _fitted(self.shared, part.model, matrix, found.x, covariance)
+            fitted = _fitted(self.shared, part.model, matrix, found.x, covariance=covariance)
             rest = part.residual(fitted.model)
             out.append(
                 Calibration(
@@ -325,6 +327,7 @@ def _fitted(
     model: InstrumentModel,
     matrix: NDArray[np.float64],
     searched: NDArray[np.float64],
+    *,
     covariance: NDArray[np.float64],
 ) -> FittedValues:
     values = shared.base(values_of(model, shared.names)) + matrix @ searched

@@ -60,7 +60,7 @@ class Change:
 
 
 def compare(
-    capture: Path, reference: Path, instrument: Path | None, tolerance: float, progress: Progress | None = None
+    capture: Path, reference: Path, instrument: Path | None, tolerance: float, *, progress: Progress | None = None
 ) -> Change:
     """Compare M/m00 of two captures of one sample in tiles; what the instrument does to both does not count.
 

@@ -205,7 +205,7 @@ def _rows(
                 values |= {"eigenvalue_deviation": m.eigenvalue_deviation, "eigenvalue_noise": m.eigenvalue_noise}
             if "stokes" in here and len(loaded) == 2:
                 values |= compare_on_sphere(
-                    loaded["mueller"], loaded["stokes"], views["stokes"], omega, here["stokes"].shape
+                    loaded["mueller"], loaded["stokes"], views["stokes"], omega, shape=here["stokes"].shape
                 )
             rows.append(Row(nm, omega, **values))
     return rows
@@ -216,6 +216,7 @@ def compare_on_sphere(
     other: ScatteringTable,
     view: ViewingGeometry,
     omega_deg: float,
+    *,
     shape: tuple[int, int],
 ) -> dict[str, float]:
     """Deviation of two xi0 tables on a virtual object (Jarecki and Kupinski, Sec. V-B): `xi0_percent`, what noise and

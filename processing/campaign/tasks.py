@@ -145,7 +145,7 @@ def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) ->
         wavelength_nm=image.header.wavelength_nm,
         omega_deg=float(image.header.omega_deg or 0.0),
         shape=(whole.mask.shape[0], whole.mask.shape[1]),
-        table=_table(task, product, geometry, (xi0, stderr, good), systematic, moves),
+        table=_table(task, product, geometry, (xi0, stderr, good), systematic=systematic, moves=moves),
         psi_deg=float(np.rad2deg(rmsd(psi))),
         magnitude_percent=100 * rmsd((magnitude(modelled) - magnitude(measured))[good]),
         eigenvalue_deviation=float(np.sqrt(max(most**2 - by_noise**2, 0.0))),
@@ -196,7 +196,7 @@ def _measure_stokes(task: CaptureTask, product: Path, view: ViewingGeometry) -> 
         wavelength_nm=header.wavelength_nm,
         omega_deg=float(header.omega_deg or 0.0),
         shape=(image.mask.shape[0], image.mask.shape[1]),
-        table=_table(task, product, geometry, (xi0, stderr, good), systematic, moves),
+        table=_table(task, product, geometry, (xi0, stderr, good), systematic=systematic, moves=moves),
         psi_deg=float("nan"),
         magnitude_percent=float("nan"),
         eigenvalue_deviation=float("nan"),
@@ -217,6 +217,7 @@ def _table(
     product: Path,
     geometry: GeometryImage,
     samples: tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.bool_]],
+    *,
     systematic: Systematic | None,
     moves: NDArray[np.floating] | None,
 ) -> str:
@@ -226,7 +227,7 @@ def _table(
     with Product(product) as opened:
         correlation, nm, simulated = neighbour_correlation(opened), opened.header.wavelength_nm, opened.simulated
     table = ScatteringTable(("xi0",), nm, simulated=simulated, has_noise=True, inputs=inputs)
-    values = xi0_samples(table, geometry, xi0, np.where(good, stderr, np.nan), correlation)
+    values = xi0_samples(table, geometry, xi0, np.where(good, stderr, np.nan), correlation=correlation)
     values = values if moves is None else np.concatenate([values, moves])
     values[:, ~good] = np.nan
     table.add(geometry.points.angles, values)

@@ -38,7 +38,7 @@ def from_axostep_command(
 
     def make(source: Path, _: object) -> Made:
         target = place(source.with_suffix(".mueller.h5"))
-        facts, is_unchanged = product_of_axostep(source, target, wavelength_nm, omega_deg, overwrite)
+        facts, is_unchanged = product_of_axostep(source, target, wavelength_nm, omega_deg, overwrite=overwrite)
         return Made((target,), is_unchanged, "".join(f"  {fact}" for fact in facts))
 
     run_batch("reading", "files", inputs, make, lambda made: typer.echo(f"{made.facts.strip()}\n{made.paths[0]}"))

@@ -108,7 +108,7 @@ def calibrate_mosaic_command(
         files = {"capture": capture} if instrument is None else {"capture": capture, "instrument": instrument}
         inputs = tuple(file_identity(path, role) for role, path in files.items())
         step = Step("calibrate-mosaic", {"capture": capture.name}, inputs)
-        fit_response(source, choose_model(source, instrument), product, step, overwrite)
+        fit_response(source, choose_model(source, instrument), product, step, overwrite=overwrite)
     summary(product)
 
 

@@ -32,7 +32,7 @@ def check_command(
 
     require_distinct([capture, reference])
     with progress_bar("check", "rows") as tick:
-        found = compare(capture, reference, instrument, tolerance, tick)
+        found = compare(capture, reference, instrument, tolerance, progress=tick)
     if found.simulated:
         typer.echo("SIMULATED data")
     typer.echo(f"{'changed' if found.count else 'unchanged'} since {reference.name}")
@@ -42,7 +42,7 @@ def check_command(
     typer.echo(f"  largest change over m00: {one.name} by {one.value:+.2g} +- {one.error:.1g} in {place}")
     typer.echo(f"  {found.count} of {found.tests} comparisons beyond noise and the tolerance of {tolerance:g}")
     table = keep(found, reference)
-    draw_drift(table, table.with_suffix(".png"), reference.name, tolerance, found.simulated)
+    draw_drift(table, table.with_suffix(".png"), reference.name, tolerance, simulated=found.simulated)
     typer.echo(f"{table}\n{table.with_suffix('.png')}")
     if found.count:
         _name_cause(capture, reference, instrument)

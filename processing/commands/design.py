@@ -171,7 +171,7 @@ def _optimized(model: InstrumentModel, noise: Noise, counts: list[int], free: st
     if not names <= {"retardances", "ratio"}:
         raise ProcessError(f"--optimize {free!r}: what may change is angles, retardances, ratio, or two of them")
     with progress_bar("optimizing", "ratios") as tick:
-        designs = optimize(model, noise, counts, dict.fromkeys(names, True), ratio, tick)
+        designs = optimize(model, noise, counts, dict.fromkeys(names, True), ratio=ratio, progress=tick)
     for d in designs:
         title = (
             f"{d.states} states, ratio {d.ratio:g}, retardances {d.generator_retardance_deg:.1f} (generator) and "

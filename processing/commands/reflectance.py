@@ -49,7 +49,7 @@ def design_command(
     ranked = {}
     for nm in model.wavelengths_nm:
         with progress_bar(f"{nm:g} nm", "angles") as tick:
-            ranked[nm] = predict(view, model, nm, instrument, linear_states(), assumptions=given, progress=tick)
+            ranked[nm] = predict(view, model, nm, instrument, states=linear_states(), assumptions=given, progress=tick)
         typer.echo(f"{nm:g} nm   standard error of xi0 over the object and Omega 20 to 90 degrees")
         for p in ranked[nm]:
             worst = int(p.median.argmax())

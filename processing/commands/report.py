@@ -26,5 +26,5 @@ def report_command(
     from processing.reports.report import write_report
 
     with progress_bar("reporting", "files") as tick:
-        written = write_report(sources, out, title, overwrite, tick)
+        written = write_report(sources, out, title, overwrite, progress=tick)
     typer.echo(str(written))

@@ -87,14 +87,14 @@ def compare_command(
             typer.echo(f"warning: no uncertainty of its instrument is known to {path}; u instr. has none", err=True)
     typer.echo("  Omega     xi0/%    u noise  u instr.    common")
     for angle in angles:
-        found = compare_on_sphere(a, b, view, angle, (size, size))
+        found = compare_on_sphere(a, b, view, angle, shape=(size, size))
         if not found["common"]:
             typer.echo(f"  {angle:5g}  no direction in which both tables have a value")
             continue
         shown = (f"{found[f'xi0_{part}percent']:9.3f}" for part in ("", "noise_", "systematic_"))
         typer.echo(f"  {angle:5g} {'  '.join(shown)} {found['common']:9.3f}")
     with whole_file(figure) as new:
-        tables_figure(a, b, view, angles[0], (size, size)).savefig(new, dpi=150)
+        tables_figure(a, b, view, angles[0], shape=(size, size)).savefig(new, dpi=150)
     typer.echo(str(figure))
 
 

@@ -18,7 +18,7 @@ from processing.labelled import open_dataset
 from processing.reflectance.tables import is_table
 
 
-def export(source: Path, to: str, out: Path, planes: Sequence[str] = (), overwrite: bool = False) -> list[Path]:
+def export(source: Path, to: str, out: Path, planes: Sequence[str] = (), *, overwrite: bool = False) -> list[Path]:
     """Write a capture, product or table in another format; returns the files written.
 
     Parameters

@@ -87,7 +87,14 @@ class Mesh(BaseModel):
             stamp = path.stat().st_mtime_ns
         except OSError as error:
             raise GeometryError(f"{path}: no such mesh file ({error.strerror}). Check the path.") from error
-        return _load(path, stamp, self.scale_mm, self.rotation_deg, self.translation_mm, self.allow_holes)
+        return _load(
+            path,
+            stamp,
+            self.scale_mm,
+            self.rotation_deg,
+            translation_mm=self.translation_mm,
+            allow_holes=self.allow_holes,
+        )
 
 
 @dataclass(frozen=True)
@@ -108,6 +115,7 @@ def _load(
     stamp: int,
     scale_mm: float,
     rotation_deg: tuple[float, float, float],
+    *,
     translation_mm: tuple[float, float, float],
     allow_holes: bool,
 ) -> _World:

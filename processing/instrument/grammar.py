@@ -120,7 +120,7 @@ class Sentence:
         courses = course(self.course, changes.conditions)
         parts = values.reshape(len(self.quantities), -1) @ courses
         for quantity, part in zip(self.quantities, parts, strict=True):
-            _add(changes, model, self.site, quantity, part)
+            _add(changes, model, self.site, quantity, part=part)
 
 
 def parsed(text: str) -> Sentence:
@@ -171,7 +171,7 @@ def course(name: str, conditions: Conditions) -> Array:
     raise KeyError(name)
 
 
-def _add(changes: Changes, model: InstrumentModel, site: str, quantity: str, part: Array) -> None:
+def _add(changes: Changes, model: InstrumentModel, site: str, quantity: str, *, part: Array) -> None:
     unit, _ = SIZES[quantity]
     value = np.deg2rad(part) if unit == "degree" else part
     if quantity == "azimuth" and site == "sample":
@@ -192,10 +192,10 @@ def _add(changes: Changes, model: InstrumentModel, site: str, quantity: str, par
     elif quantity in ("shift right", "shift down"):
         changes.shift_px = changes.shift_px + np.outer(value, (1, 0) if quantity == "shift right" else (0, 1))
     else:
-        _bend(changes, model, site, quantity, value)
+        _bend(changes, model, site, quantity, value=value)
 
 
-def _bend(changes: Changes, model: InstrumentModel, site: str, quantity: str, value: Array) -> None:
+def _bend(changes: Changes, model: InstrumentModel, site: str, quantity: str, *, value: Array) -> None:
     """A Mueller matrix beside an element: behind it on the way to the sample, before it on the way from there."""
     if site == "path":
         element, angle, behind = model.generator[-1].name, np.zeros(value.shape), True

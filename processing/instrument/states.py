@@ -71,6 +71,7 @@ def rotating_retarders(
     states: int = RGB950_STATES,
     step_deg: float = RGB950_STEP_DEG,
     ratio: float = RGB950_RATIO,
+    *,
     repeats: int = 1,
     axes: tuple[str, str] = ("psg", "psa"),
 ) -> StateTable:

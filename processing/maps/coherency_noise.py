@@ -30,7 +30,7 @@ def coherency_noise(image: MuellerImage) -> EigenvalueNoise:
         with_m00 = (whole - known_m00 - brightness) / (8 * m00**2)
         along = np.sqrt(known_m00) / (4 * m00)
         return EigenvalueNoise.of(
-            total, row, whole / (4 * m00) ** 2, along, np.sqrt(brightness) / np.abs(m00), with_m00
+            total, row, whole / (4 * m00) ** 2, along, m00=np.sqrt(brightness) / np.abs(m00), with_m00=with_m00
         )
 
 

@@ -43,7 +43,7 @@ def _systematic_planes(systematic: Systematic) -> dict[str, Plane]:
 
 
 def extrapolate_mueller(
-    source: Path, geometry_file: Path, material_file: Path, out: Path, step: Step, overwrite: bool
+    source: Path, geometry_file: Path, material_file: Path, out: Path, *, step: Step, overwrite: bool
 ) -> dict[str, Any]:
     """Write the extrapolated Mueller image of a Stokes product; returns its facts.
 
@@ -88,7 +88,7 @@ def extrapolate_mueller(
             planes[DIRECTIONS] = moved / found.alpha_0_stderr
         every = PLANES | _systematic_planes(systematic)
         facts[INPUTS] = "; ".join(systematic.labels)
-    with ProductWriter(out, EXTRAPOLATED, header, shape, every, steps, overwrite) as writer:
+    with ProductWriter(out, EXTRAPOLATED, header, shape, planes=every, steps=steps, overwrite=overwrite) as writer:
         writer.write(slice(0, shape[0]), **planes)
         writer.seal(facts)
     return facts

@@ -88,7 +88,7 @@ class Noise(Protocol):
 
 
 def set_magnitudes(
-    planes: Planes, derived: Mapping[str, Derived], m: Array, image: Noise, widened: Array | float = 1.0
+    planes: Planes, derived: Mapping[str, Derived], m: Array, image: Noise, *, widened: Array | float = 1.0
 ) -> None:
     """Replace value and error of every length of a vector, and add its 95 % interval.
 
@@ -202,7 +202,12 @@ def widened(value: Array, bounds: Array, systematic: Array) -> NDArray[np.float3
 
 
 def set_retardance(
-    planes: Planes, derived: Mapping[str, Derived], error: Array, linear_error: Array, is_determined: NDArray[np.bool_]
+    planes: Planes,
+    derived: Mapping[str, Derived],
+    error: Array,
+    linear_error: Array,
+    *,
+    is_determined: NDArray[np.bool_],
 ) -> None:
     """Retardance also folds at 180 degrees, where fast and slow axis, right and left, are one.
 
@@ -399,10 +404,10 @@ def set_any_dominant(planes: Planes, derived: Mapping[str, Derived], is_determin
             _put(planes, name, value, half, *ends)
 
 
-def _put(planes: Planes, name: str, value: Array, error: Array, low: Array, high: Array) -> None:
+def _put(planes: Planes, name: str, value: Array, error: Array, *ends: Array) -> None:
     planes[name] = np.asarray(value, dtype=np.float32)
     planes[f"{name}_errors"] = np.asarray(error, dtype=np.float32)
-    planes[f"{name}_95"] = np.stack([low, high]).astype(np.float32)
+    planes[f"{name}_95"] = np.stack(ends).astype(np.float32)
 
 
 def _normal(planes: Planes, name: str) -> Planes:

@@ -329,11 +329,11 @@ def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
     # Intervals by noise alone first: those of the second are wider by the instrument's uncertainty.
     if image.seen.all():
         planes = quantities_block(image, (), PAPER_PAIRS)
-        quantities_block(image, (), PAPER_PAIRS, moves, by_input)
+        quantities_block(image, (), PAPER_PAIRS, moves, by_input=by_input)
     else:
         names = light_quantities(image.seen) if light else determined_maps(image.seen, PAPER_PAIRS)
         planes = partial_block(image, names, PAPER_PAIRS)
-        partial_block(image, names, PAPER_PAIRS, moves, by_input)
+        partial_block(image, names, PAPER_PAIRS, moves, by_input=by_input)
     if light:
         planes, by_input = named(planes), named(by_input)
     for name in by_input:

@@ -48,6 +48,7 @@ def partial_block(
     names: list[str],
     pairs: Pairs,
     moves: NDArray[np.float64] | None = None,
+    *,
     by_input: dict[str, NDArray[Any]] | None = None,
 ) -> dict[str, NDArray[Any]]:
     """The maps of these names with their errors, and `lit`, for an image or for some rows of it.

@@ -66,6 +66,7 @@ def quantities_of_mueller(
     out: Path,
     step: Step,
     extra: Sequence[str] = (),
+    *,
     pairs: Pairs = PAPER_PAIRS,
     overwrite: bool = False,
     progress: Progress | None = None,
@@ -86,7 +87,9 @@ def quantities_of_mueller(
     with Product(source) as product:
         maps = _maps(product, extra, pairs)
         steps = (*product.steps, step)
-        with ProductWriter(out, "quantities", product.header, product.shape, maps.planes, steps, overwrite) as writer:
+        with ProductWriter(
+            out, "quantities", product.header, product.shape, planes=maps.planes, steps=steps, overwrite=overwrite
+        ) as writer:
             for rows in product.row_blocks(BLOCK_PIXELS):
                 if rows.stop > writer.rows_done:
                     writer.write(rows, **maps.block(rows))
@@ -189,6 +192,7 @@ def quantities_block(
     extra: Sequence[str],
     pairs: Pairs,
     moves: NDArray[np.float64] | None = None,
+    *,
     by_input: dict[str, NDArray[Any]] | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Planes of the product for an image, or for some rows of it.
@@ -220,7 +224,7 @@ def quantities_block(
             found[f"{name}_errors"] = np.stack(errors).reshape(value.shape).astype(np.float32)
         found["retardance_vector_covariance"] = _covariance(image, derived["retardance_vector_deg"].gradient)
         polar = lu_chipman(m)
-        _set_intervals(found, derived, m, image, polar.depolarizer)
+        _set_intervals(found, derived, m, image, depolarizer=polar.depolarizer)
         if moves is not None:
             moved = set_systematic(found, derived, moves)
             if by_input is not None:
@@ -240,10 +244,11 @@ def _set_intervals(
     derived: Mapping[str, Derived],
     m: NDArray[np.float64],
     image: MuellerImage | ExtrapolatedImage,
+    *,
     depolarizer: NDArray[np.floating],
 ) -> None:
     """What first order does not give: see `processing.maps.intervals`."""
-    retardance_errors = found["retardance_deg_errors"], found["retardance_linear_deg_errors"]
+    error, linear_error = found["retardance_deg_errors"], found["retardance_linear_deg_errors"]
     diattenuation_error = found["diattenuation_errors"]
     factor: NDArray[np.float64] | float = 1.0
     found["td_missed_noise"] = np.zeros_like(found["td_missed"])
@@ -254,7 +259,7 @@ def _set_intervals(
         xi = np.moveaxis(found["coherency_eigenvalues"], 0, -1).astype(float)
         set_eigenvalues(found, noise, corrected(xi, noise, image.covariance_of_depolarizer()))
         factor = widen_dominant(found, noise)
-    set_magnitudes(found, derived, m, image, factor)
+    set_magnitudes(found, derived, m, image, widened=factor)
     set_angles(found)
     if isinstance(image, MuellerImage):
         set_any_dominant(found, derived, np.isfinite(factor))
@@ -262,7 +267,7 @@ def _set_intervals(
     # What is left of the light after the diattenuator carries the noise of all of it.
     passed = 1 - np.square(np.asarray(derived["diattenuation"].value) + diattenuation_error)
     is_determined = (passed > 0) & (weakest * passed > SEEN * _relative_error(image))
-    set_retardance(found, derived, *retardance_errors, is_determined)
+    set_retardance(found, derived, error, linear_error, is_determined=is_determined)
     set_depolarization_power(found, passed > SEEN * _relative_error(image))
     if "differential_retardance_deg" in found:
         set_differential(found, is_determined & _is_principal(found))

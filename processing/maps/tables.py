@@ -33,6 +33,7 @@ def xi0_samples(
     image: GeometryImage,
     xi0: NDArray[np.floating],
     stderr: NDArray[np.floating],
+    *,
     correlation: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """xi0 and its variance (2, N) on the pixels of an object, covariances within each bin of the table included.
@@ -53,7 +54,7 @@ def _xi0_values(table: ScatteringTable, image: GeometryImage, product: Product) 
     """Values (planes, N) of a table from a whole xi0 product; NaN where that is not valid."""
     valid = product.get("valid")[image.mask] > 0
     xi0, error = (product.get(name)[image.mask] for name in ("xi0", "xi0_errors"))
-    values = xi0_samples(table, image, xi0, np.where(valid, error, np.nan), noise_between(product))
+    values = xi0_samples(table, image, xi0, np.where(valid, error, np.nan), correlation=noise_between(product))
     if table.inputs:
         values = np.concatenate([values, product.get("xi0_directions")[:, image.mask]])
     values[:, ~valid] = np.nan
@@ -97,7 +98,13 @@ def _table_for(product: Product, layout: Layout) -> ScatteringTable:
         names, frames, has_noise = MUELLER, "renderer", bool(np.isfinite(product.get("mueller_errors")).any())
     inputs = tuple(str(product.facts[INPUTS]).split("; ")) if INPUTS in product.facts else ()
     return ScatteringTable(
-        names, product.header.wavelength_nm, layout, product.simulated, frames, has_noise=has_noise, inputs=inputs
+        names,
+        product.header.wavelength_nm,
+        layout,
+        product.simulated,
+        frames=frames,
+        has_noise=has_noise,
+        inputs=inputs,
     )
 
 
@@ -122,6 +129,7 @@ def tabulate(
     geometry_file: Path,
     layout: Layout,
     table: ScatteringTable | None = None,
+    *,
     progress: Progress | None = None,
 ) -> ScatteringTable:
     """Add the images of products to a table; a new one is made if none is given.

@@ -70,7 +70,9 @@ STOKES_PLANES = {
 }
 
 
-def xi0_of_mueller(source: Path, out: Path, step: Step, overwrite: bool, progress: Progress | None) -> dict[str, Any]:
+def xi0_of_mueller(
+    source: Path, out: Path, step: Step, overwrite: bool, *, progress: Progress | None
+) -> dict[str, Any]:
     """Write the eigenvalue image of a Mueller product; returns its facts.
 
     xi0 is the largest eigenvalue without what noise adds to it, see `processing.polarization.eigenvalue_noise`.
@@ -80,7 +82,9 @@ def xi0_of_mueller(source: Path, out: Path, step: Step, overwrite: bool, progres
         steps = (*product.steps, step)
         systematic = Systematic.of_product(product)
         planes = MUELLER_PLANES | systematic_planes(systematic)
-        with ProductWriter(out, "xi0", product.header, product.shape, planes, steps, overwrite) as writer:
+        with ProductWriter(
+            out, "xi0", product.header, product.shape, planes=planes, steps=steps, overwrite=overwrite
+        ) as writer:
             for rows in product.row_blocks():
                 if rows.stop > writer.rows_done:
                     image = MuellerImage.of(product, rows)
@@ -173,7 +177,7 @@ def refitted(
 
 
 def xi0_of_stokes(
-    source: Path, geometry_file: Path, material_file: Path, out: Path, step: Step, overwrite: bool
+    source: Path, geometry_file: Path, material_file: Path, out: Path, *, step: Step, overwrite: bool
 ) -> dict[str, Any]:
     """Write the xi0 image of a Stokes product, with a reflectance model as the dominant process; returns its facts.
 
@@ -195,13 +199,15 @@ def xi0_of_stokes(
     facts = _facts(found.xi0, found.xi0_stderr, found.valid, "two coefficients of the Stokes image")
     text = "of the noise of pixels by distance in rows and columns"
     fitted = np.tensordot(image.analyzers, image.values.astype(float), axes=1)
-    with _two_coefficients(out, found, facts, header, steps, overwrite, systematic, fitted, m0) as writer:
+    with _two_coefficients(
+        out, found, facts, header, steps=steps, overwrite=overwrite, systematic=systematic, fitted=fitted, m0=m0
+    ) as writer:
         writer.array("neighbour_correlation", image.neighbour_correlation, "", text)
     return facts
 
 
 def xi0_of_partial(
-    source: Path, geometry_file: Path, material_file: Path, out: Path, step: Step, overwrite: bool
+    source: Path, geometry_file: Path, material_file: Path, out: Path, *, step: Step, overwrite: bool
 ) -> dict[str, Any]:
     """Write the xi0 image of a partial polarimeter's product, with a reflectance model as the dominant process.
 
@@ -225,7 +231,9 @@ def xi0_of_partial(
     found = estimate(fitted, image.told_variance.reshape(size), image.w, m0)
     facts = _facts(found.xi0, found.xi0_stderr, found.valid, f"two coefficients of {image.facts['determined']}")
     steps = (*image.steps, step)
-    with _two_coefficients(out, found, facts, image.header, steps, overwrite, systematic, fitted, m0):
+    with _two_coefficients(
+        out, found, facts, image.header, steps=steps, overwrite=overwrite, systematic=systematic, fitted=fitted, m0=m0
+    ):
         pass
     return facts
 
@@ -236,6 +244,7 @@ def _two_coefficients(
     found: Xi0Estimate,
     facts: dict[str, Any],
     header: CaptureHeader,
+    *,
     steps: tuple[Step, ...],
     overwrite: bool,
     systematic: Systematic | None,
@@ -260,7 +269,7 @@ def _two_coefficients(
         facts |= _systematic_facts(systematic, planes["xi0_systematic"][found.valid])
     rows, columns = found.xi0.shape
     every = STOKES_PLANES | systematic_planes(systematic)
-    with ProductWriter(out, "xi0", header, (rows, columns), every, steps, overwrite) as writer:
+    with ProductWriter(out, "xi0", header, (rows, columns), planes=every, steps=steps, overwrite=overwrite) as writer:
         yield writer
         writer.write(slice(0, rows), **planes)
         writer.seal(facts)

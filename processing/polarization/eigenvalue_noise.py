@@ -59,7 +59,7 @@ class EigenvalueNoise:
 
     @classmethod
     def of(
-        cls, total: Array, row: Array, diagonal: Array, along: Array, m00: Array, with_m00: Array
+        cls, total: Array, row: Array, diagonal: Array, along: Array, *, m00: Array, with_m00: Array
     ) -> EigenvalueNoise:
         """From second moments of the noise E of H / (2 m00) about the dominant process v.
 

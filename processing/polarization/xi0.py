@@ -92,7 +92,7 @@ def estimate(
     sums = _Sums(p.shape[1:])
     for k, row in enumerate(rows):
         vk = None if v is None else np.asarray(v[k], dtype=float)
-        sums.add(np.asarray(p[k], dtype=float), model @ row, row[0], vk, weighted)
+        sums.add(np.asarray(p[k], dtype=float), model @ row, row[0], vk, weighted=weighted)
     return sums.solve(len(rows), max_condition, max_stderr)
 
 
@@ -126,7 +126,7 @@ class _Sums:
         self.scaled = False
         self.have_variance = False
 
-    def add(self, p: Array, p0: Array, pid: float, v: Array | None, weighted: bool) -> None:
+    def add(self, p: Array, p0: Array, pid: float, v: Array | None, *, weighted: bool) -> None:
         self.have_variance = v is not None
         weight = 1.0 / v if weighted and v is not None else np.ones(())
         spread = weight * weight * v if v is not None else weight

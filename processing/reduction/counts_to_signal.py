@@ -146,6 +146,7 @@ class BlockReader:
         states: NDArray[np.int64],
         correction: Correction,
         counts: CountsCorrection | None = None,
+        *,
         struck: NDArray[np.int64] | None = None,
     ) -> None:
         """`struck` (H, 4): state among `states`, channel, row and column of intensities that are left out."""
@@ -226,7 +227,7 @@ class BlockReader:
                 block[k, channel] = image[rows.start - first : rows.stop - first]
 
     def load(
-        self, frames: NDArray[np.generic], start: int, stop: int, out: NDArray[np.float32], mask: NDArray[np.uint8]
+        self, frames: NDArray[np.generic], start: int, stop: int, out: NDArray[np.float32], *, mask: NDArray[np.uint8]
     ) -> NDArray[np.float32] | None:
         """Fill `out` (states, channels, stop - start) with signal, flag the mask; returns what `signal` returns."""
         raw = frames[:, :, start:stop]

@@ -28,6 +28,7 @@ def mueller_facts(
     noise: NoiseModel | None,
     correction: Correction,
     product: ProductWriter,
+    *,
     states: int,
     weighted: bool,
 ) -> dict[str, Any]:

@@ -52,6 +52,7 @@ def field_of(
     model: InstrumentModel,
     states: NDArray[np.int64],
     changes: Changes | None,
+    *,
     level: NDArray[np.float64] | None = None,
 ) -> Field | None:
     """W where retardances vary over the image; None where W is the same everywhere.

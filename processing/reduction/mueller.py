@@ -36,6 +36,7 @@ def reduce_mueller(
     model: InstrumentModel,
     out: Path,
     steps: tuple[Step, ...],
+    *,
     correction: Correction | None = None,
     choice: Choice | None = None,
     left_out: Exclusions | None = None,
@@ -56,10 +57,12 @@ def reduce_mueller(
     NotDetermined : W has a lower rank than states of this instrument can have.
     CaptureError : angles or frames are missing or not finite.
     """
-    reduction = MuellerReduction.of(capture, model, correction, choice, left_out)
+    reduction = MuellerReduction.of(capture, model, correction, choice, left_out=left_out)
     noise, levels, planes = reduction.noise, reduction.levels, reduction.planes
     solver = reduction.solver(capture)
-    with ProductWriter(out, "mueller", capture.header, capture.frame_shape, planes, steps, overwrite) as product:
+    with ProductWriter(
+        out, "mueller", capture.header, capture.frame_shape, planes=planes, steps=steps, overwrite=overwrite
+    ) as product:
         product.array(
             "measurement_matrix", reduction.w, "", "W (state, channel, 16): intensity = W . vec(M), row-major"
         )
@@ -86,8 +89,8 @@ def reduce_mueller(
                 noise,
                 reduction.correction,
                 product,
-                len(reduction.states),
-                reduction.choice.weighted,
+                states=len(reduction.states),
+                weighted=reduction.choice.weighted,
             )
         except CaptureError as error:
             product.discard()

@@ -143,6 +143,7 @@ class MuellerReduction:
         model: InstrumentModel,
         correction: Correction | None = None,
         choice: Choice | None = None,
+        *,
         left_out: Exclusions | None = None,
     ) -> MuellerReduction:
         """Prepare the reduction of a capture; see `reduce_mueller` for parameters and errors."""
@@ -155,7 +156,7 @@ class MuellerReduction:
         counts, struck = counts_correction(changes, model), _among(left_out.hits, every, states)
         basis = determined_basis(model)
         varies = changes is not None and bool(changes.field_retardance_rad)
-        reader = BlockReader(capture, states, correction, counts, struck)
+        reader = BlockReader(capture, states, correction, counts, struck=struck)
         source = LeveledSource.of(reader, model, basis, varies)
         w, levels = source.leveled(measurement_matrix(capture, model, states, changes))
         what = "".join(f"{text}: " for text in (capture.path, *warnings))
@@ -165,7 +166,7 @@ class MuellerReduction:
                 f"{capture.path}: instrument {model.name!r} determines {inversion.rank} of 16 numbers; --physical and "
                 "field_retardance need all of them. Leave them away."
             )
-        field = field_of(capture, model, states, changes, levels.relative if levels else None)
+        field = field_of(capture, model, states, changes, level=levels.relative if levels else None)
 
         def matrix(other: InstrumentModel) -> tuple[Array, Array]:
             w = source.leveled(measurement_matrix(capture, other, states, capture_changes(capture, other, states)))[0]
@@ -202,7 +203,7 @@ class MuellerReduction:
 
     def solver(self, capture: Capture) -> Solver:
         """The solver of row blocks of the capture, which is open."""
-        reader = BlockReader(capture, self.states, self.correction, self.counts, self.struck)
+        reader = BlockReader(capture, self.states, self.correction, self.counts, struck=self.struck)
         return self.choice.solver(MuellerSolver(self.inversion, reader, self.noise), self.field)
 
     def block(self, solver: Solver, rows: slice) -> dict[str, NDArray[Any]]:

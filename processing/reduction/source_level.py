@@ -112,7 +112,7 @@ class SourceMoments:
         for part in _parts(reader.capture, middle):
             frames = reader.read(part)
             flags, signal = np.zeros(frames.shape[2], np.uint8), np.empty(frames.shape, np.float32)
-            reader.load(frames, 0, frames.shape[2], signal, flags)
+            reader.load(frames, 0, frames.shape[2], signal, mask=flags)
             y = signal.reshape(rows, -1)[:, flags == 0].astype(float)
             mean = y.mean(axis=0)
             y = y[:, mean > 0] / np.sqrt(mean[mean > 0])

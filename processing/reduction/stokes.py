@@ -103,6 +103,7 @@ def reduce_stokes(
     model: InstrumentModel,
     out: Path,
     steps: tuple[Step, ...],
+    *,
     method: str = DEFAULT_METHOD,
     correction: Correction | None = None,
     noise: NoiseModel | None = None,
@@ -135,12 +136,12 @@ def reduce_stokes(
     systematic = _systematic(capture, model, states)
     correction = correction or Correction.of(capture)
     noise = noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
-    merged = merge(capture, states, correction, noise, counts_correction(changes, model), progress)
+    merged = merge(capture, states, correction, noise, counts=counts_correction(changes, model), progress=progress)
     frame = merged.signal
     if response is not None:
         frame = corrected_frame(frame, response, layout, analyzers)
     channels = demosaic(frame, layout, method)
-    found = stokes(channels, analyzers, layout, method, merged, frame)
+    found = stokes(channels, analyzers, layout, method, merged=merged, frame=frame)
     planes = PLANES
     if systematic is not None:
         planes = PLANES | SYSTEMATIC
@@ -152,10 +153,12 @@ def reduce_stokes(
         if name != "pixel_flags":
             values[..., lost | dark if name in RATIOS else lost] = np.nan
     rows, columns = channels.shape[1:]
-    facts = _facts(found, analyzers, noise, correction, method, len(states))
+    facts = _facts(found, analyzers, noise, correction, method=method, states=len(states))
     facts["warnings"] += cut_off
     facts |= references(capture, model)
-    with ProductWriter(out, "stokes", capture.header, (rows, columns), planes, steps, overwrite) as product:
+    with ProductWriter(
+        out, "stokes", capture.header, (rows, columns), planes=planes, steps=steps, overwrite=overwrite
+    ) as product:
         product.array("measurement_matrix", model_rows, "", "W (channel, 16): intensity = W . vec(M), row-major")
         solve = tuple(map(tuple, np.linalg.pinv(analyzers).tolist()))
         for name, parts in (("neighbour_correlation", (1, 2)), ("neighbour_correlation_s0", (0,))):
@@ -173,6 +176,7 @@ def stokes(
     analyzers: NDArray[np.float64],
     layout: MosaicLayout,
     method: str,
+    *,
     merged: MergedFrame,
     frame: NDArray[np.float32] | None = None,
 ) -> dict[str, NDArray[Any]]:
@@ -196,7 +200,7 @@ def stokes(
         variance = shot * light + floor
         if merged.relative is not None:
             variance += _by_channel(merged.relative, layout, channels) * light**2
-    covariance = stokes_covariance(variance, layout, method, solve, frame)
+    covariance = stokes_covariance(variance, layout, method, solve, frame=frame)
     found = {"s0": s0, "s1": s1, "s2": s2, "closure": closure, "stokes_covariance": covariance}
     found |= {f"s{k}_errors": np.sqrt(covariance[k]) for k in range(LINEAR)}
     found |= linear_polarization(s0, s1, s2, covariance)
@@ -286,6 +290,7 @@ def _facts(
     analyzers: NDArray[np.float64],
     noise: NoiseModel | None,
     correction: Correction,
+    *,
     method: str,
     states: int,
 ) -> dict[str, Any]:

@@ -120,8 +120,8 @@ def fit_values(
     values: ArrayLike,
     rows: ArrayLike,
     covariance: ArrayLike,
-    max_pixels: int = 5000,
     *,
+    max_pixels: int = 5000,
     correlation: bool = False,
     moved: Sequence[tuple[ArrayLike, ArrayLike]] = (),
 ) -> MaterialFit:
@@ -182,7 +182,8 @@ def _fit_dominant(model: _Forward, data: Array, covariance: Array, moved: Sequen
     whiten = np.linalg.inv(np.linalg.cholesky(noise)) @ parts
     seen, *changes = (np.einsum("nki,ni->nk", whiten, values) for values in (data, *moved))
     square = _unexplained(seen, [change - seen for change in changes])
-    return _result(found, -curvature.sum(axis=0), scores, square, 6 * len(data) - 4, "dominant process", off)
+    free = 6 * len(data) - 4
+    return _result(found, -curvature.sum(axis=0), scores, square, free=free, method="dominant process", off=off)
 
 
 def _root(model: _Forward, start: Array, scaled: Array) -> Array:
@@ -319,7 +320,7 @@ def _fit_correlation(own: _Correlation, moved: Sequence[_Correlation]) -> Materi
     more = max(1.0, float(np.sqrt(max(square - free, 0) / unlike)))
     scores, curvature = np.einsum("nkp,nk->np", slopes, left), jacobian.T @ jacobian
     method, apart = "linear correlation", more * np.array(departures)
-    result = _result(found, curvature, scores, square, free, method, off, departures=apart)
+    result = _result(found, curvature, scores, square, free=free, method=method, off=off, departures=apart)
     share = float(np.sqrt(np.sum(left**2) / np.sum(own.data**2)))
     return replace(result, residual=share, correlation=float(np.nanmean(rho)))
 
@@ -368,6 +369,7 @@ def _result(
     curvature: Array,
     scores: Array,
     square: float,
+    *,
     free: int,
     method: str,
     off: Array,

@@ -32,6 +32,7 @@ def export(
     path: Path | str,
     white_m00: float = 1.0,
     empty: Literal["nearest", "nan"] = "nearest",
+    *,
     pad_wavelengths: bool = True,
     progress: Callable[[int, int], None] | None = None,
     uncertainty: bool = False,

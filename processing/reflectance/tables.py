@@ -61,6 +61,7 @@ class ScatteringTable:
         wavelength_nm: float,
         layout: Layout = "degree",
         simulated: bool = False,
+        *,
         frames: str = "",
         has_noise: bool = False,
         inputs: tuple[str, ...] = (),
@@ -217,7 +218,8 @@ class ScatteringTable:
             self._lay_out_bins(add_group(entry, "data", "NXdata"), title)
             sums = add_group(entry, "sums", "NXcollection")
             for name, values in zip(_SUMS, (self._sum[: len(self.quantities)], self._square), strict=True):
-                _put(sums, name, values, entry["data"], ("quantity", "bin"), "", f"{name} over the samples of a bin")
+                text = f"{name} over the samples of a bin"
+                _put(sums, name, values, entry["data"], dimensions=("quantity", "bin"), units="", long_name=text)
             for name in AXES:
                 sums[name] = getattr(self.axes, name)
                 sums[name].attrs.update({"units": "degree", "long_name": "centres of all bins along the axis"})
@@ -228,26 +230,58 @@ class ScatteringTable:
     def _lay_out_bins(self, data: h5py.Group, title: str) -> None:
         """What people look at: of each bin that has samples their mean and variance, their number, and its angles."""
         add_scales(data, {"quantity": len(self.quantities)})
-        _put(data, "bin", self.bins, data, (), "", "number of the bin, counted over theta_h, theta_d, phi_d")
+        _put(
+            data,
+            "bin",
+            self.bins,
+            data,
+            dimensions=(),
+            units="",
+            long_name="number of the bin, counted over theta_h, theta_d, phi_d",
+        )
         data["bin"].make_scale("bin")
         data["quantity_name"] = [name.encode() for name in self.quantities]
         attach(data["quantity_name"], data, ["quantity"])
-        _put(data, "count", self.count, data, ["bin"], "", "samples in the bin")
+        _put(data, "count", self.count, data, dimensions=["bin"], units="", long_name="samples in the bin")
         for name, angle in zip(AXES, self.axes.angles(self.bins), strict=True):
-            _put(data, name, np.rad2deg(angle).round(9), data, ["bin"], "degree", "centre of the bin")
-        _put(data, "mean", self.mean, data, ("quantity", "bin"), "", "mean of the samples in the bin")
+            _put(
+                data,
+                name,
+                np.rad2deg(angle).round(9),
+                data,
+                dimensions=["bin"],
+                units="degree",
+                long_name="centre of the bin",
+            )
         _put(
-            data, "sample_variance", self.variance, data, ("quantity", "bin"), "", "variance of the samples in the bin"
+            data,
+            "mean",
+            self.mean,
+            data,
+            dimensions=("quantity", "bin"),
+            units="",
+            long_name="mean of the samples in the bin",
+        )
+        _put(
+            data,
+            "sample_variance",
+            self.variance,
+            data,
+            dimensions=("quantity", "bin"),
+            units="",
+            long_name="variance of the samples in the bin",
         )
         for name, text in UNCERTAINTIES.items():
             if name in self.uncertainties:
-                _put(data, name, self.uncertainties[name], data, ("quantity", "bin"), "", text)
+                values = self.uncertainties[name]
+                _put(data, name, values, data, dimensions=("quantity", "bin"), units="", long_name=text)
         if self.inputs:
             add_scales(data, {"input": len(self.inputs)})
             data["input_name"] = [name.encode() for name in self.inputs]
             attach(data["input_name"], data, ["input"])
             text = "what one standard uncertainty of each uncertain input of the instrument does to the mean"
-            _put(data, "directions", self.directions, data, ("input", "quantity", "bin"), "", text)
+            dimensions = ("input", "quantity", "bin")
+            _put(data, "directions", self.directions, data, dimensions=dimensions, units="", long_name=text)
         default_plot(data, "mean", ("quantity", "bin"), title)
         data["mean"].attrs["coordinates"] = " ".join([*AXES, "count", "quantity_name"])
         for name in (*AXES, "count"):
@@ -272,8 +306,15 @@ class ScatteringTable:
             quantities, has_noise, inputs = names, "u_noise" in data, [str(i) for i in a.get("inputs", ())]
             if version < 3 and names[1:2] == ["xi0_variance"]:
                 quantities, has_noise, inputs = names[:1], True, [n.split("_", 3)[3] for n in names[2:]]
-            kind = float(a["wavelength_nm"]), a["layout"], bool(a["simulated"]), str(a["frames"])
-            table = cls(tuple(quantities), *kind, has_noise, tuple(inputs))
+            table = cls(
+                tuple(quantities),
+                float(a["wavelength_nm"]),
+                a["layout"],
+                bool(a["simulated"]),
+                frames=str(a["frames"]),
+                has_noise=has_noise,
+                inputs=tuple(inputs),
+            )
             if not np.allclose(sums["theta_h_deg"][...], table.axes.theta_h_deg):
                 raise TableError(f"{path}: its theta_h axis is not that of layout {a['layout']!r}")
             bins = require_dataset(data, "bin", (None,), "i")[...]
@@ -312,6 +353,7 @@ def _put(
     name: str,
     values: NDArray[Any],
     scales: h5py.Group,
+    *,
     dimensions: Sequence[str],
     units: str,
     long_name: str,

@@ -12,7 +12,7 @@ from processing.reports.figure_style import entitle
 from processing.whole_file import whole_file
 
 
-def draw_drift(table: Path, figure_path: Path, title: str, tolerance: float, simulated: bool) -> None:
+def draw_drift(table: Path, figure_path: Path, title: str, tolerance: float, *, simulated: bool) -> None:
     """Draw the light and the elements of M/m00 of all checks of a table, with the band of the tolerance."""
     from matplotlib.figure import Figure
 

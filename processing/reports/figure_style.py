@@ -43,6 +43,7 @@ def grid_figure(
     title: str,
     simulated: bool,
     columns: int = 4,
+    *,
     sphere: NDArray[np.floating] | None = None,
 ) -> Figure:
     """Maps in rows of `columns`, as in `map_figure`; where no `vmax` is given it is the 99.5th percentile.

@@ -98,7 +98,12 @@ def campaign_figure(result: CampaignResult, title: str, with_paper: bool = False
 
 
 def tables_figure(
-    reference: ScatteringTable, other: ScatteringTable, view: ViewingGeometry, omega_deg: float, shape: tuple[int, int]
+    reference: ScatteringTable,
+    other: ScatteringTable,
+    view: ViewingGeometry,
+    omega_deg: float,
+    *,
+    shape: tuple[int, int],
 ) -> Figure:
     """xi0 of two tables on a virtual object, and their difference."""
     from processing.reports.figure_style import grid_figure

@@ -86,6 +86,7 @@ def write_report(
     out: Path,
     title: str,
     overwrite: bool = False,
+    *,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Write one self-contained HTML file about captures, products, CSV tables and pictures.

@@ -51,7 +51,9 @@ class Quantities(FileStep):
     def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
         from processing.maps.quantities import quantities_of_mueller
 
-        quantities_of_mueller(self.source, out, record, self.also, self.pairs, overwrite, progress)
+        quantities_of_mueller(
+            self.source, out, record, self.also, pairs=self.pairs, overwrite=overwrite, progress=progress
+        )
 
 
 @dataclass(frozen=True)
@@ -108,11 +110,11 @@ class Xi0(FileStep):
         from processing.maps.xi0 import xi0_of_mueller, xi0_of_partial, xi0_of_stokes
 
         if self._of_stokes():
-            xi0_of_stokes(self.source, *self._model(), out, record, overwrite)
+            xi0_of_stokes(self.source, *self._model(), out, step=record, overwrite=overwrite)
         elif self._by_model():
-            xi0_of_partial(self.source, *self._model(), out, record, overwrite)
+            xi0_of_partial(self.source, *self._model(), out, step=record, overwrite=overwrite)
         else:
-            xi0_of_mueller(self.source, out, record, overwrite, progress)
+            xi0_of_mueller(self.source, out, record, overwrite, progress=progress)
 
 
 @dataclass(frozen=True)
@@ -149,7 +151,7 @@ class Extrapolation(FileStep):
     def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
         from processing.maps.extrapolation import extrapolate_mueller
 
-        extrapolate_mueller(self.source, self.geometry, self.material, out, record, overwrite)
+        extrapolate_mueller(self.source, self.geometry, self.material, out, step=record, overwrite=overwrite)
 
 
 def geometry_identities(geometry: Path) -> list[dict[str, object]]:

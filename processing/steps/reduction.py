@@ -121,7 +121,17 @@ class Reduction(FileStep):
             model = choose_model(capture, self.instrument)
             if mueller:
                 choice = Choice(self.weighted, self.covariance, self.physical, noise)
-                reduce_mueller(capture, model, out, (record,), correction, choice, left_out, overwrite, progress)
+                reduce_mueller(
+                    capture,
+                    model,
+                    out,
+                    (record,),
+                    correction=correction,
+                    choice=choice,
+                    left_out=left_out,
+                    overwrite=overwrite,
+                    progress=progress,
+                )
                 return
             # Imported here: OpenCV is not needed for a Mueller capture.
             from processing.reduction.mosaic.pixel_response import read_response
@@ -130,7 +140,17 @@ class Reduction(FileStep):
             response = read_response(self.analyzers, capture.frame_shape) if self.analyzers else None
             method = record.arguments["demosaic"]
             reduce_stokes(
-                capture, model, out, (record,), method, correction, noise, response, left_out, overwrite, progress
+                capture,
+                model,
+                out,
+                (record,),
+                method=method,
+                correction=correction,
+                noise=noise,
+                response=response,
+                left_out=left_out,
+                overwrite=overwrite,
+                progress=progress,
             )
 
 

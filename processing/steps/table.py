@@ -71,7 +71,7 @@ class Tabulation(FileStep):
         _refuse_twice(record, before)
         grown = Step("table", record.arguments, (*record.inputs, file_identity(self.out, "table")))
         table = ScatteringTable.load(self.out)
-        tabulate(self.sources, self.geometry, self.layout, table, progress).save(self.out, (*before, grown))
+        tabulate(self.sources, self.geometry, self.layout, table, progress=progress).save(self.out, (*before, grown))
         return self.out
 
 

@@ -72,6 +72,7 @@ class SimulatedBench:
         scene: SceneImage,
         instrument: InstrumentModel,
         wavelength_nm: float,
+        *,
         rows: int = 600,
         columns: int = 600,
         detector: Detector = DETECTOR,
@@ -127,7 +128,7 @@ class SimulatedBench:
         ndarray of uint16, (rows, columns), or (channels, rows, columns) with several channels that do not share the
         detector as a mosaic or as beams side by side.
         """
-        expected, shot = self._expected(angles_deg, exposure_s, index, light, omega_deg, time_s)
+        expected, shot = self._expected(angles_deg, exposure_s, index, light, omega_deg=omega_deg, time_s=time_s)
         random = np.random.default_rng([self.seed, index + (1 << 31)])
         expected += np.float32(self.dark_current_e_per_s * exposure_s)
         electrons = random.poisson(np.maximum(expected, 0)).astype(np.float32)
@@ -145,7 +146,7 @@ class SimulatedBench:
         omega_deg: float = 180.0,
     ) -> Image:
         """Expected photo-electrons of an exposure, without dark current and noise; same shape as `expose`."""
-        return self._expected(angles_deg, exposure_s, index, light, omega_deg, None)[0]
+        return self._expected(angles_deg, exposure_s, index, light, omega_deg=omega_deg, time_s=None)[0]
 
     def _expected(
         self,
@@ -153,6 +154,7 @@ class SimulatedBench:
         exposure_s: float,
         index: int,
         light: float,
+        *,
         omega_deg: float,
         time_s: float | None,
     ) -> tuple[Image, Shot]:

@@ -20,6 +20,7 @@ def write_virtual_capture(
     bench: SimulatedBench,
     instrument: InstrumentModel,
     omega_deg: float,
+    *,
     exposure_s: float = 0.02,
     states: int = RGB950_STATES,
     darks: int = 4,
@@ -58,7 +59,9 @@ def write_virtual_capture(
     role = ("dark",) * darks + ("sample",) * states
     now = datetime.now(UTC).isoformat(timespec="seconds")
     with h5py.File(path, "w") as h5:
-        create_layout(h5, header, angles, role, (bench.rows, bench.columns), np.uint16, now)
+        create_layout(
+            h5, header, angles, role, frame_shape=(bench.rows, bench.columns), dtype=np.uint16, start_time=now
+        )
         frames = h5["entry/instrument/detector/data"]
         for k in range(len(role)):
             here = {axis: float(values[k]) for axis, values in angles.items()}

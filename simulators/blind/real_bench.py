@@ -168,6 +168,7 @@ def make_bench(
     seed: int,
     configs: Path,
     group: str = "real",
+    *,
     pixels: int = PIXELS,
     polarimeter: Polarimeter = RGB950,
 ) -> RealBench:
@@ -201,12 +202,12 @@ def make_bench(
     ]
     scenes = _scenes(random)
     zigzag = any(d.kind == "rotation_backlash" for d in draws)
-    angles = state_angles(polarimeter.states, mosaic, zigzag, polarimeter.step_deg, polarimeter.ratio)
+    angles = state_angles(polarimeter.states, mosaic, zigzag, polarimeter.step_deg, ratio=polarimeter.ratio)
     if mosaic:
         del angles["psa"]
 
     def sound() -> Bench:
-        return declared_bench(model.at(nm), nm, pixels, mosaic, electrons)
+        return declared_bench(model.at(nm), nm, pixels, mosaic, electrons=electrons)
 
     found: dict[tuple[int, str | None], TrueFault] = {}
     for capture, scene in scenes.items():
@@ -214,9 +215,9 @@ def make_bench(
         bench, exposed, faults = taken.exposed()
         sample = Sample(kind="air" if capture == "air" else "unknown")
         quiet = counted(bench, expected_electrons(bench, exposed))
-        write_capture(away / f"{capture}.h5", bench, quiet, angles, sample, text)
+        write_capture(away / f"{capture}.h5", bench, quiet, angles, sample=sample, instrument=text)
         target = away / f"{capture}_noisy.h5" if capture == VALIDATION else own / f"{capture}.h5"
-        write_capture(target, bench, digitize(bench, exposed, random), angles, sample, text)
+        write_capture(target, bench, digitize(bench, exposed, random), angles, sample=sample, instrument=text)
         np.save(away / f"{capture}.npy", true_mueller(scene, pixels))
         for i, fault in faults.items():
             known = found.setdefault((i, fault.capture), fault)

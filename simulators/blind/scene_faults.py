@@ -80,6 +80,7 @@ class LitSupport:
         strength: float = 1.0,
         radius_mm: float = 20.0,
         below_mm: float = 30.0,
+        *,
         uneven: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         self.scene, self.strength = scene, strength

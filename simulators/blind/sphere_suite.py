@@ -143,6 +143,7 @@ def take(
     fault: SphereFault,
     declared: InstrumentModel,
     wavelength_nm: float,
+    *,
     omega_deg: float,
     seed: int,
     light: float = 1.0,
@@ -150,14 +151,16 @@ def take(
     """Write a capture of the fault under the declared instrument; `light` 1 fills 80 % of the full well."""
     size, states = STOKES if declared.mosaic else MUELLER
     true = fault.instrument.at(wavelength_nm)
-    small = SimulatedBench(fault.scene, true, wavelength_nm, size // 4, size // 4, flux_e_per_s=1.0)
+    small = SimulatedBench(fault.scene, true, wavelength_nm, rows=size // 4, columns=size // 4, flux_e_per_s=1.0)
     brightest = max(
         float(small.expected_electrons({"psg": 9.0 * n, "psa": 4.91 * 9.0 * n}, 1.0, omega_deg=omega_deg).max())
         for n in range(0, 40, 5)
     )
     flux = light * 0.8 * float(DETECTOR.full_well_e or 1e4) / (brightest * EXPOSURE_S)
-    bench = SimulatedBench(fault.scene, fault.instrument, wavelength_nm, size, size, flux_e_per_s=flux, seed=seed)
-    write_virtual_capture(path, bench, declared, omega_deg, EXPOSURE_S, states=states, name=path.stem)
+    bench = SimulatedBench(
+        fault.scene, fault.instrument, wavelength_nm, rows=size, columns=size, flux_e_per_s=flux, seed=seed
+    )
+    write_virtual_capture(path, bench, declared, omega_deg, exposure_s=EXPOSURE_S, states=states, name=path.stem)
 
 
 def _signed(random: np.random.Generator, low: float, high: float) -> float:

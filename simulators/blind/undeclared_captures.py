@@ -209,7 +209,7 @@ def expose(bench: Bench, scene: Scene, angles_deg: dict[str, Array]) -> Array:
                 levels[which] *= course(k)
             m = scene.at((xs - dx) / bench.columns, (ys - dy) / bench.rows, levels)
             if bench.turned:
-                m = _turned(scene, bench, xs - dx, ys - dy, sum(t(k) for t in bench.turned))
+                m = _turned(scene, bench, xs - dx, ys - dy, angle=sum(t(k) for t in bench.turned))
         g, a = bench.generated(angles, k), bench.analyzed(angles, k)
         light = np.einsum("ci,hwij,...j->chw", a, m, g) if g.ndim == 1 else np.einsum("ci,hwij,hwj->chw", a, m, g)
         out[k] = _on_mosaic(light) if bench.mosaic else light[0]
@@ -226,7 +226,7 @@ def expose(bench: Bench, scene: Scene, angles_deg: dict[str, Array]) -> Array:
     return np.asarray(out)
 
 
-def _turned(scene: Scene, bench: Bench, xs: Array, ys: Array, angle: float) -> Array:
+def _turned(scene: Scene, bench: Bench, xs: Array, ys: Array, *, angle: float) -> Array:
     """Mueller matrices of the scene turned counter-clockwise by an angle (radians) about the middle of the image."""
     c, s = np.cos(angle), np.sin(angle)
     x, y = xs - (bench.columns - 1) / 2, ys - (bench.rows - 1) / 2
@@ -270,6 +270,7 @@ def write_capture(
     bench: Bench,
     counts: NDArray[np.uint16],
     angles_deg: dict[str, Array],
+    *,
     sample: Sample,
     instrument: str,
 ) -> None:
@@ -296,7 +297,15 @@ def write_capture(
     )
     n = counts.shape[0]
     with h5py.File(path, "w") as h5:
-        create_layout(h5, header, angles_deg, ("sample",) * n, counts.shape[1:], counts.dtype, "2020-01-01T00:00:00")
+        create_layout(
+            h5,
+            header,
+            angles_deg,
+            ("sample",) * n,
+            frame_shape=counts.shape[1:],
+            dtype=counts.dtype,
+            start_time="2020-01-01T00:00:00",
+        )
         h5["entry/instrument/detector/data"][...] = counts[:, None]
         for axis, values in angles_deg.items():
             h5[f"entry/instrument/{axis}/value"][...] = values
@@ -323,7 +332,7 @@ def expected(bench: Bench, electrons: Array) -> Array:
     return np.asarray(expected_electrons(bench, electrons) / bench.gain)
 
 
-def declared_bench(model: InstrumentModel, nm: float, size: int, mosaic: bool, electrons: float) -> Bench:
+def declared_bench(model: InstrumentModel, nm: float, size: int, mosaic: bool, *, electrons: float) -> Bench:
     """A bench that is what its model (resolved at the wavelength) declares."""
     bench = Bench(rows=size, columns=size, mosaic=mosaic, electrons=electrons, wavelength_nm=nm)
     for element in model.elements():
@@ -346,7 +355,7 @@ def _radians(value_deg: float | dict[float, float]) -> float:
 
 
 def state_angles(
-    states: int, mosaic: bool, zigzag: bool, step_deg: float | None = None, ratio: float = 4.91
+    states: int, mosaic: bool, zigzag: bool, step_deg: float | None = None, *, ratio: float = 4.91
 ) -> dict[str, Array]:
     """Angles of both axes in degrees; `zigzag` reaches states from both sides. Steps divide a turn, or half of it."""
     step = step_deg or (180.0 if mosaic else 360.0) / states

@@ -53,7 +53,7 @@ def draw_axis(bench: Bench, random: np.random.Generator) -> str:
     return "psg" if bench.mosaic else str(random.choice(["psg", "psa"]))
 
 
-def _number(name: str, attribute: str, place: str, parameter: str, low: float, high: float) -> SizedFault:
+def _number(name: str, attribute: str, place: str, parameter: str, *, low: float, high: float) -> SizedFault:
     def fault(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (low, high)) -> Truth:
         value = draw_signed(random, *sizes)
         setattr(bench, attribute, getattr(bench, attribute) + np.deg2rad(value))
@@ -263,14 +263,16 @@ def tone_curve(bench: Bench, random: np.random.Generator, states: int, sizes: Si
 
 
 LISTED: dict[str, SizedFault] = {
-    "psg_retardance": _number("psg_retardance", "dg", "psg_retarder", "retardance", 0.1, 4.0),
-    "psa_retardance": _number("psa_retardance", "da", "psa_retarder", "retardance", 0.1, 4.0),
-    "psg_azimuth": _number("psg_azimuth", "og", "psg_retarder", "azimuth", 0.03, 1.0),
-    "psa_azimuth": _number("psa_azimuth", "oa", "psa_retarder", "azimuth", 0.03, 1.0),
-    "analyzer_azimuth": _number("analyzer_azimuth", "lp", "", "azimuth", 0.03, 1.0),
+    "psg_retardance": _number("psg_retardance", "dg", "psg_retarder", "retardance", low=0.1, high=4.0),
+    "psa_retardance": _number("psa_retardance", "da", "psa_retarder", "retardance", low=0.1, high=4.0),
+    "psg_azimuth": _number("psg_azimuth", "og", "psg_retarder", "azimuth", low=0.03, high=1.0),
+    "psa_azimuth": _number("psa_azimuth", "oa", "psa_retarder", "azimuth", low=0.03, high=1.0),
+    "analyzer_azimuth": _number("analyzer_azimuth", "lp", "", "azimuth", low=0.03, high=1.0),
     "psg_extinction": _extinction("psg_extinction", "extinction_g", "psg_polarizer"),
     "psa_extinction": _extinction("psa_extinction", "extinction_a", "analyzer"),
-    "generator_ellipticity": _number("generator_ellipticity", "ellipticity", "psg_polarizer", "ellipticity", 0.1, 2.0),
+    "generator_ellipticity": _number(
+        "generator_ellipticity", "ellipticity", "psg_polarizer", "ellipticity", low=0.1, high=2.0
+    ),
     "retarder_diattenuation": retarder_diattenuation,
     "retarder_transmission": retarder_transmission,
     "field_retardance": field_retardance,

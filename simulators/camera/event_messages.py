@@ -72,14 +72,14 @@ class EventMessages:
         header = struct.pack(">BBHHH", _KEY, _ACK_WANTED if wait_s else 0, _EVENT, len(content), self._number)
         # The camera may have been unplugged meanwhile.
         with contextlib.suppress(RuntimeError):
-            self._sender.submit(_send, header + content, (address, 0), (host, port), wait_s, tries)
+            self._sender.submit(_send, header + content, (address, 0), (host, port), wait_s, tries=tries)
 
     def close(self) -> None:
         """Send no more; waits for the message that is under way."""
         self._sender.shutdown(cancel_futures=True)
 
 
-def _send(message: bytes, camera: tuple[str, int], host: tuple[str, int], wait_s: float, tries: int) -> None:
+def _send(message: bytes, camera: tuple[str, int], host: tuple[str, int], wait_s: float, *, tries: int) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as channel:
         channel.bind(camera)
         for _ in range(tries):

@@ -60,7 +60,12 @@ class FramePackets:
 
 
 def send(
-    frame: FramePackets, register: Callable[[int], int], address: str, lost_ratio: float, numbers: range | None = None
+    frame: FramePackets,
+    register: Callable[[int], int],
+    address: str,
+    lost_ratio: float,
+    *,
+    numbers: range | None = None,
 ) -> None:
     """Send a frame from an address to where the controlling host wants it; loses that part of the packets.
 

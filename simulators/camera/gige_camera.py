@@ -296,7 +296,7 @@ class GigeCamera:
         """Send packets once more, while the frame is kept."""
         for frame in list(self.sent):
             if frame.frame_id == frame_id:
-                send(frame, self._bootstrap, self.address, self.lost_ratio, range(first, last + 1))
+                send(frame, self._bootstrap, self.address, self.lost_ratio, numbers=range(first, last + 1))
 
     def released(self) -> None:
         """Without anybody who controls it a camera stops."""

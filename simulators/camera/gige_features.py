@@ -41,7 +41,7 @@ _AT_POWER_UP: dict[str, str | Number] = {
 }
 
 
-def _register(name: str, address: int, kind: str = "IntReg", access: str = "RW", index: str = "") -> str:
+def _register(name: str, address: int, kind: str = "IntReg", access: str = "RW", *, index: str = "") -> str:
     length, sign = (8, "") if kind == "FloatReg" else (4, "<Sign>Unsigned</Sign>")
     if 0x300 <= address < SOFTWARE_TRIGGER:
         index = '<pIndex Offset="0x20">TriggerSelectorValue</pIndex>'
@@ -52,11 +52,11 @@ def _register(name: str, address: int, kind: str = "IntReg", access: str = "RW",
     )
 
 
-def _integer(name: str, address: int, low: int, high: int | str, access: str = "RW", step: int = 1) -> str:
-    return _number(name, f"{name}Register", low, high, step) + _register(name, address, access=access)
+def _integer(name: str, address: int, low: int, high: int | str, *, access: str = "RW", step: int = 1) -> str:
+    return _number(name, f"{name}Register", low, high, step=step) + _register(name, address, access=access)
 
 
-def _number(name: str, register: str, low: int, high: int | str, step: int = 1) -> str:
+def _number(name: str, register: str, low: int, high: int | str, *, step: int = 1) -> str:
     top = f"<Max>{high}</Max>" if isinstance(high, int) else f"<pMax>{high}</pMax>"
     return (
         f'<Integer Name="{name}" NameSpace="Standard"><pValue>{register}</pValue><Min>{low}</Min>{top}'
@@ -64,7 +64,7 @@ def _number(name: str, register: str, low: int, high: int | str, step: int = 1) 
     )
 
 
-def _float(name: str, address: int, low: float, high: float, access: str = "RW", unit: str = "") -> str:
+def _float(name: str, address: int, low: float, high: float, *, access: str = "RW", unit: str = "") -> str:
     unit = f"<Unit>{unit}</Unit>" if unit else ""
     return (
         f'<Float Name="{name}" NameSpace="Standard"><pValue>{name}Register</pValue><Min>{low}</Min><Max>{high}</Max>'
@@ -173,14 +173,14 @@ def _identity(table: NodeMap) -> list[str]:
         _text("DeviceSerialNumber", 0xD8, 16),
         _text("DeviceUserID", 0xE8, 16, "RW"),
     ]
-    return texts + ([_float(table.temperature, TEMPERATURE_C, -40.0, 100.0, "RO")] if table.temperature else [])
+    return texts + ([_float(table.temperature, TEMPERATURE_C, -40.0, 100.0, access="RO")] if table.temperature else [])
 
 
 def _region(table: NodeMap, width: int, height: int) -> list[str]:
     angles = any(pixel_format(name).angles for name in table.pixel_formats)
     features = [
-        _integer("SensorWidth", SENSOR_WIDTH, 1, width, "RO"),
-        _integer("SensorHeight", SENSOR_HEIGHT, 1, height, "RO"),
+        _integer("SensorWidth", SENSOR_WIDTH, 1, width, access="RO"),
+        _integer("SensorHeight", SENSOR_HEIGHT, 1, height, access="RO"),
         _most("WidthMax", width, "X", angles=angles),
         _most("HeightMax", height, "Y", angles=angles),
         _formula("OffsetXMax", "M - W", M="WidthMax", W="Width"),

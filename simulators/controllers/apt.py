@@ -22,7 +22,7 @@ class APTModel:
     """What differs between the models: name, serial number, scale (counts per deg, deg/s, deg/s^2), stage id."""
 
     def __init__(
-        self, name: str, hardware_type: int, serial_number: int, scale: tuple[float, float, float], stage_id: int
+        self, name: str, hardware_type: int, serial_number: int, scale: tuple[float, float, float], *, stage_id: int
     ) -> None:
         self.name = name
         self.hardware_type = hardware_type
@@ -35,19 +35,23 @@ class APTModel:
 
 def k10cr1() -> APTModel:
     """Stepper rotation mount with its own controller."""
-    return APTModel("K10CR1", 16, 55000001, (409600 / 3, 7329109.0, 1502.0), 0)
+    return APTModel("K10CR1", 16, 55000001, (409600 / 3, 7329109.0, 1502.0), stage_id=0)
 
 
 def kdc101() -> APTModel:
     """DC servo controller with a PRM1-Z8 stage."""
     per_deg, tick_s = 1919.6418578623391, 2048 / 6e6
-    return APTModel("KDC101", 44, 27000001, (per_deg, per_deg * 65536 * tick_s, per_deg * 65536 * tick_s**2), 6)
+    return APTModel(
+        "KDC101", 44, 27000001, (per_deg, per_deg * 65536 * tick_s, per_deg * 65536 * tick_s**2), stage_id=6
+    )
 
 
 def kbd101() -> APTModel:
     """Brushless servo controller with a DDR25 stage, which it does not name."""
     per_deg, sample_s = 1_440_000 / 360, 102.4e-6
-    return APTModel("KBD101", 45, 28000001, (per_deg, per_deg * 65536 * sample_s, per_deg * 65536 * sample_s**2), 0)
+    return APTModel(
+        "KBD101", 45, 28000001, (per_deg, per_deg * 65536 * sample_s, per_deg * 65536 * sample_s**2), stage_id=0
+    )
 
 
 class APTEmulator(Emulator):

@@ -258,9 +258,9 @@ class ZaberEmulator(Emulator):
         message_id = f"{numbers[2]:02d} " if len(numbers) == 3 else ""
         for device in self.devices:
             if address in (0, device.address):
-                self._answer(device, axis, message_id, match["words"].split(), wants_checksum)
+                self._answer(device, axis, message_id, match["words"].split(), sums=wants_checksum)
 
-    def _answer(self, device: ZaberDevice, axis: int, message_id: str, words: list[str], sums: bool) -> None:
+    def _answer(self, device: ZaberDevice, axis: int, message_id: str, words: list[str], *, sums: bool) -> None:
         try:
             if axis > 1:
                 raise Rejected("BADAXIS")

@@ -28,7 +28,7 @@ class _RigFile(BaseModel):
 
 @contextmanager
 def serve(
-    rig_file: Path, target: Path, sample: str, mode: str = "drr", wavelength_nm: float = 662, omega_deg: float = 35
+    rig_file: Path, target: Path, sample: str, mode: str = "drr", *, wavelength_nm: float = 662, omega_deg: float = 35
 ) -> Iterator[SimulatedRig]:
     """Start the emulators of a rig file and write `target`, the same rig with device paths in place of `sim:` ports.
 

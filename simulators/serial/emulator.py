@@ -37,6 +37,7 @@ class EmulatedAxis:
         clock: Clock,
         speed_deg_s: float = 300.0,
         acceleration_deg_s2: float = 1500.0,
+        *,
         min_deg: float | None = None,
         max_deg: float | None = None,
         homed: bool = False,

@@ -197,6 +197,6 @@ def runner_of(rig: RecordedRig) -> Callable[..., CaptureRunner]:
         )
         detector = Detector(black_level_counts=BLACK)
         writer: Any = RecordedWriter()
-        return CaptureRunner(rig, table, writer, detector, StopRequest(), **options)  # type: ignore[arg-type]
+        return CaptureRunner(rig, table, writer, detector, stop=StopRequest(), **options)  # type: ignore[arg-type]
 
     return make

@@ -32,7 +32,7 @@ def path(tmp_path: Path) -> Path:
         role=("sample",) * STATES,
         repeats=np.full(STATES, 2),
     )
-    CaptureWriter.create(tmp_path / "c.h5", HEADER, table, SHAPE, "2026-01-01T00:00:00").abandon()
+    CaptureWriter.create(tmp_path / "c.h5", HEADER, table, SHAPE, start_time="2026-01-01T00:00:00").abandon()
     (left,) = tmp_path.iterdir()
     return left
 

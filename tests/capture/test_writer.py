@@ -60,7 +60,9 @@ def create(tmp_path: Path):
     opened = []
 
     def make(name: str = "c.h5", **options: Any) -> CaptureWriter:
-        opened.append(CaptureWriter.create(tmp_path / name, HEADER, table(), SHAPE, "2026-01-01T00:00:00", **options))
+        opened.append(
+            CaptureWriter.create(tmp_path / name, HEADER, table(), SHAPE, start_time="2026-01-01T00:00:00", **options)
+        )
         return opened[-1]
 
     yield make
@@ -273,7 +275,7 @@ def test_an_error_of_the_disc_beside_the_states_says_which(create, monkeypatch, 
 def test_the_frame_of_each_channel_is_written(tmp_path):
     header = HEADER.model_copy(update={"channels": ("ordinary", "extraordinary")})
     pixels = np.arange(2 * 4 * 5, dtype=np.uint16).reshape(2, 4, 5)
-    writer = CaptureWriter.create(tmp_path / "two.h5", header, table(), SHAPE, "2026-01-01T00:00:00")
+    writer = CaptureWriter.create(tmp_path / "two.h5", header, table(), SHAPE, start_time="2026-01-01T00:00:00")
     writer.put(StateRecord(0, pixels, {"psg": Position(0.0, 0, True)}, {"exposure_s": 0.03}))
     path = writer.seal("failed", {}, keep_partial=True)
     with h5py.File(path) as h5:

@@ -89,7 +89,7 @@ def test_stokes_capture_without_arm_angle(configs: Path, synthetic_capture, tmp_
     with Capture(path) as capture:
         reduce_stokes(capture, capture.instrument, tmp_path / "s.h5", (Step("reduce", {}),))
     with pytest.raises(ProcessError, match="does not say its arm angle"):
-        xi0_of_stokes(tmp_path / "s.h5", geometry, material, tmp_path / "x.h5", Step("xi0", {}), False)
+        xi0_of_stokes(tmp_path / "s.h5", geometry, material, tmp_path / "x.h5", step=Step("xi0", {}), overwrite=False)
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory, configs: Path) -> Path:
             update={"full_well_e": 4e6, "gain_e_per_count": 100.0, "bits": 16}
         )
         for omega in ANGLES:
-            bench = SimulatedBench(scene, instrument, 662, size, size, detector, flux_e_per_s=1e8, seed=int(omega))
+            bench = SimulatedBench(
+                scene, instrument, 662, rows=size, columns=size, detector=detector, flux_e_per_s=1e8, seed=int(omega)
+            )
             write_virtual_capture(where / f"{kind}_{omega:g}.h5", bench, instrument, omega, states=states, darks=2)
     return where
 
@@ -148,7 +150,13 @@ def small(folder, configs, name, omega, states=40, true=None, scene="white_diffu
     """A small capture; fewer than 16 states determine no matrix."""
     instrument = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     bench = SimulatedBench(
-        Scene.load(configs / f"scenes/{scene}.yaml"), true or instrument, 662, 32, 32, seed=1, flux_e_per_s=5e5
+        Scene.load(configs / f"scenes/{scene}.yaml"),
+        true or instrument,
+        662,
+        rows=32,
+        columns=32,
+        seed=1,
+        flux_e_per_s=5e5,
     )
     path = folder / f"{name}.h5"
     write_virtual_capture(path, bench, instrument, omega, states=states, darks=2, name=scene)

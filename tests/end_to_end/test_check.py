@@ -23,7 +23,7 @@ def air(tmp_path, configs):
     def take(name: str, turned_deg: float, seed: int, flux: float = 5e5, kind: str = "air") -> Path:
         turned = {nm: value + turned_deg for nm, value in azimuth.items()}
         true = instrument.with_values({"psg_retarder": {"azimuth_deg": turned}})
-        bench = SimulatedBench(scene, true, 662, 32, 32, seed=seed, flux_e_per_s=flux)
+        bench = SimulatedBench(scene, true, 662, rows=32, columns=32, seed=seed, flux_e_per_s=flux)
         path = tmp_path / f"{name}.h5"
         write_virtual_capture(path, bench, instrument, 180, darks=2)
         with h5py.File(path, "r+") as h5:

@@ -38,7 +38,7 @@ def capture(folder: Path, configs: Path, scene: Scene, name: str, seed: int = 1)
     declared = InstrumentModel.load(configs / f"instruments/{name}.yaml")
     fault = SphereFault("the paper's", scene, declared, first_surface_of(scene.material))
     path = folder / f"{name}.h5"
-    take(path, fault, declared, NM, OMEGA_DEG, seed)
+    take(path, fault, declared, NM, omega_deg=OMEGA_DEG, seed=seed)
     return path
 
 
@@ -120,7 +120,7 @@ def test_geometry_and_instrument_that_were_found_end_the_error(configs, scene, t
     moved = scene_faults.ArmZero(scene_faults.moved_sphere(scene, 0.5, -0.3, 0.02), 2.0)
     fault = SphereFault("three", moved, scene_faults.turned_generator(declared, 1.5), scene.material)
     path, new = tmp_path / "c.h5", tmp_path / "new.yaml"
-    take(path, fault, declared, NM, OMEGA_DEG, 3)
+    take(path, fault, declared, NM, omega_deg=OMEGA_DEG, seed=3)
     material = configs / "materials/red_print.yaml"
     geometry = configs / "geometries/one_inch_sphere.yaml"
     given = ["--instrument", configs / "instruments/rgb950.yaml", "--reflectance", material, "--geometry", geometry]

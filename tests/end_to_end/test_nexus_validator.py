@@ -93,7 +93,7 @@ def laid_out(folder: Path) -> list[Path]:
     paths = []
     for kind, planes in kinds.items():
         paths.append(folder / f"{kind}.h5")
-        with ProductWriter(paths[-1], kind, header, SHAPE, planes, ()) as writer:
+        with ProductWriter(paths[-1], kind, header, SHAPE, planes=planes, steps=()) as writer:
             writer.array("curve", np.ones(3), "count", "a curve")
             writer.seal({})
     return paths

@@ -191,7 +191,7 @@ def test_compressed_planes_are_plain_deflate_and_read_the_same(tmp_path):
     }
     path = tmp_path / "p.h5"
     header = CaptureHeader(title="t", simulated=True, mode="drr", wavelength_nm=600)
-    with ProductWriter(path, "xi0", header, shape, planes, ()) as writer:
+    with ProductWriter(path, "xi0", header, shape, planes=planes, steps=()) as writer:
         writer.write(slice(0, shape[0]), **values)
         writer.seal({"rank": 16})
     with h5py.File(path) as h5:

@@ -37,7 +37,7 @@ def xi0_product(tmp_path):
     header = CaptureHeader(title="ball", simulated=True, mode="drr", wavelength_nm=662)
     distance, radius = disc()
     planes = {name: Plane((), "", name) for name in ("eigenvalue_spread", "xi0", "xi0_errors", "valid")}
-    with ProductWriter(tmp_path / "b.xi0.h5", "xi0", header, (80, 80), planes, ()) as writer:
+    with ProductWriter(tmp_path / "b.xi0.h5", "xi0", header, (80, 80), planes=planes, steps=()) as writer:
         valid = (distance < radius).astype(np.float32)
         xi0 = np.where(valid > 0, 0.4, np.nan).astype(np.float32)
         writer.write(slice(0, 80), xi0=xi0, xi0_errors=xi0 * 0 + 0.01, valid=valid, eigenvalue_spread=xi0)

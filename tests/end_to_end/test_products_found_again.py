@@ -46,7 +46,7 @@ def original(tmp_path_factory: pytest.TempPathFactory, configs: Path) -> Path:
     """A small simulated capture with noise."""
     path = tmp_path_factory.mktemp("original") / "c.h5"
     instrument = InstrumentModel.load(configs / "instruments/rgb950.yaml")
-    bench = SimulatedBench(Scene.load(configs / "scenes/red_sphere.yaml"), instrument, 662, 24, 24, seed=1)
+    bench = SimulatedBench(Scene.load(configs / "scenes/red_sphere.yaml"), instrument, 662, rows=24, columns=24, seed=1)
     write_virtual_capture(path, bench, instrument, 35, states=40, darks=2)
     return path
 

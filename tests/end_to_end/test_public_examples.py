@@ -45,7 +45,7 @@ def made(tmp_path_factory, configs):
         ("air", "air", 180, off, declared),
         ("mosaic", "red_sphere", 35, mosaic, mosaic),
     ):
-        bench = SimulatedBench(scenes[scene], true, 662, 24, 32, seed=1, flux_e_per_s=5e5)
+        bench = SimulatedBench(scenes[scene], true, 662, rows=24, columns=32, seed=1, flux_e_per_s=5e5)
         states = 1 if said.mosaic else 40
         write_virtual_capture(folder / f"{name}.h5", bench, said, omega, states=states, darks=2, name=scene)
     with h5py.File(folder / "air.h5", "r+") as h5:

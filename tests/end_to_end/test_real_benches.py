@@ -129,7 +129,7 @@ def test_every_fault_changes_what_a_capture_file_says(group, kind, configs):
     angles = state_angles(polarimeter.states, mosaic, False)
 
     def stored(faults):
-        bench = declared_bench(model, 662.0, 16, mosaic, 15_000.0)
+        bench = declared_bench(model, 662.0, 16, mosaic, electrons=15_000.0)
         truths = [fault(bench, np.random.default_rng(3), polarimeter.states) for fault in faults]
         light = expose(bench, Scene(np.random.default_rng(4)), angles)
         told = angles

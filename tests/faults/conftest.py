@@ -176,9 +176,9 @@ def run_with(quick_rig: Callable[..., Path], tmp_path: Path) -> Callable[..., tu
             try:
                 check_with_devices(job, rig, folder)
                 if resume is None:
-                    session.take(job, rig, folder / "run.h5", StopRequest(), watchers)
+                    session.take(job, rig, folder / "run.h5", StopRequest(), observers=watchers)
                 else:
-                    session.resume(job, rig, resume, StopRequest(), watchers)
+                    session.resume(job, rig, resume, StopRequest(), observers=watchers)
             except (AcquisitionError, DeviceError) as caught:
                 error = caught
         return error, next(path for path in sorted(folder.glob("run.h5*")) if path.suffix != ".png")

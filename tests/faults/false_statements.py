@@ -174,7 +174,7 @@ def take(kind: str, seed: int, folder: Path) -> tuple[bool, bool, bool, bool]:
         false = _False(rig, kind, draw.randint(DARKS + 2, DARKS + STATES - 3))
         try:
             check_with_devices(job, rig, folder)
-            session.take(job, rig, path, StopRequest(), [false])
+            session.take(job, rig, path, StopRequest(), observers=[false])
         except (AcquisitionError, DeviceError) as caught:
             error = caught
     found = next(file for file in folder.glob("run.h5*") if file.suffix != ".png")

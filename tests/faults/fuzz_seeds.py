@@ -173,7 +173,15 @@ def _capture_files(folder: Path) -> Sequence[Path]:
          "detector": {"bits": 12, "black_level_counts": 64}, "instrument_yaml": INSTRUMENT.read_text()}
     )  # fmt: skip
     with h5py.File(path, "w") as h5:
-        create_layout(h5, header, {"psg": psg, "psa": 4.91 * psg}, ("sample",) * n, (12, 10), np.uint16, "2026-01-01")
+        create_layout(
+            h5,
+            header,
+            {"psg": psg, "psa": 4.91 * psg},
+            ("sample",) * n,
+            frame_shape=(12, 10),
+            dtype=np.uint16,
+            start_time="2026-01-01",
+        )
         h5["entry/instrument/detector/data"][...] = rng.integers(64, 4000, (n, 1, 12, 10))
         for axis, values in (("psg", psg), ("psa", 4.91 * psg)):
             h5[f"entry/instrument/{axis}/value"][...] = values

@@ -31,7 +31,7 @@ import numpy as np
 from simulated_rig import write_rig
 
 # Imported once here, not anew in each child:
-import acquisition.commands.campaign
+import acquisition.commands.campaign  # noqa: F401
 import acquisition.screen.quicklook  # noqa: F401
 import processing.reflectance.material_fit  # noqa: F401
 from acquisition.commands.application import main as acquire

@@ -88,7 +88,7 @@ def _night(tmp_path, campaign, config, jobs, observer):
     stop = StopRequest()
     folder = CampaignFolder(tmp_path / "night", campaign)
     operator = Operator(lambda text: None, stop, True, True)
-    observer.run = CampaignRun(campaign, config, folder, operator, stop, [observer], home=True)
+    observer.run = CampaignRun(campaign, config, folder, operator, stop=stop, observers=[observer], home=True)
     try:
         assert observer.run.run(jobs)
     finally:

@@ -21,7 +21,7 @@ def sealed(folder: Path, closing: dict[str, Any]) -> dict[str, Any]:
     table = StateTable(
         angles_deg={"psg": np.zeros(1)}, role=("sample",), exposure_s=np.full(1, 0.01), repeats=np.ones(1, dtype=int)
     )
-    writer = CaptureWriter.create(folder / "c.h5", HEADER, table, (4, 4), "2026-01-01T00:00:00")
+    writer = CaptureWriter.create(folder / "c.h5", HEADER, table, (4, 4), start_time="2026-01-01T00:00:00")
     path = writer.seal("complete", closing)
     with Capture(path) as capture:
         assert capture.status == "complete"

@@ -47,7 +47,7 @@ def product(path):
     header = CaptureHeader(
         title="", simulated=True, mode="drr", wavelength_nm=662, detector=Detector(), channels=("camera",)
     )
-    return ProductWriter(path, "mueller", header, (50, 40), {"mueller": Plane((4, 4), "count", "M")}, ())
+    return ProductWriter(path, "mueller", header, (50, 40), planes={"mueller": Plane((4, 4), "count", "M")}, steps=())
 
 
 @pytest.mark.parametrize("free", [0, 127_999, 200_000])

@@ -199,7 +199,7 @@ def test_resume_goes_to_the_first_missing_state_by_an_allowed_way(rig_with, tmp_
 
     with open_rig(config) as rig:
         refuse_failed(check_with_devices(job, rig, tmp_path))
-        session.take(job, rig, tmp_path / "run.h5", stop, [StopThere()])
+        session.take(job, rig, tmp_path / "run.h5", stop, observers=[StopThere()])
         steps = watch(rig)
         path = next(tmp_path.glob("run.h5*"))
         again = job_of(path, config)

@@ -31,7 +31,7 @@ def product(tmp_path_factory):
     values = np.random.default_rng(1).normal(1000, 1, (4, 4, *SHAPE)).astype(np.float32)
     planes = {"mueller": Plane((4, 4), "count", "M"), "mueller_errors": Plane((4, 4), "count", "its errors")}
     path = tmp_path_factory.mktemp("product") / "image.h5"
-    with ProductWriter(path, "mueller", header, SHAPE, planes, ()) as writer:
+    with ProductWriter(path, "mueller", header, SHAPE, planes=planes, steps=()) as writer:
         writer.write(slice(0, SHAPE[0]), mueller=values, mueller_errors=values * 0 + 1)
         return writer.seal({"warnings": []})
 

@@ -27,7 +27,9 @@ def test_closure_of_the_channels(scene: str, configs: Path, tmp_path: Path) -> N
     with Capture(out) as capture:
         assert capture.instrument is not None
         raw = capture.frames(0)[0].astype(float)
-        facts = reduce_stokes(capture, capture.instrument, tmp_path / "s.h5", (Step("reduce", {}),), "superpixel")
+        facts = reduce_stokes(
+            capture, capture.instrument, tmp_path / "s.h5", (Step("reduce", {}),), method="superpixel"
+        )
     image = StokesImage.load(tmp_path / "s.h5")
     i90, i45, i135, i0 = raw[0::2, 0::2], raw[0::2, 1::2], raw[1::2, 0::2], raw[1::2, 1::2]
     good = image.mask == 0

@@ -87,7 +87,9 @@ FOUND = {
 def test_how_much_of_the_polarized_light_the_model_takes(rows, wavelength_um):
     data = load(rows, wavelength_um)
     every = np.tile(np.eye(16), (len(data.m), 1, 1))
-    fit = fit_values(data.geometry, data.m.reshape(-1, 16).T, np.eye(16), every, len(data.m), correlation=True)
+    fit = fit_values(
+        data.geometry, data.m.reshape(-1, 16).T, np.eye(16), every, max_pixels=len(data.m), correlation=True
+    )
     best = explained(data, fit.model("PTFE", 1000 * wavelength_um).mueller_jones(data.geometry, 1000 * wavelength_um))
     own = explained(data, xi0_and_dominant(data.m)[1])
     plain = first_surface.Model(name="PTFE", constants={633: first_surface.Constants(n=1.35)})

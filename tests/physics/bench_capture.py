@@ -26,7 +26,7 @@ def bench_capture(
     sample = Sample(kind="air" if air else "unknown")
     folder.mkdir(exist_ok=True)
     path = folder / "capture.h5"
-    write_capture(path, bench, counts, told(angles) if told else angles, sample, file.read_text())
+    write_capture(path, bench, counts, told(angles) if told else angles, sample=sample, instrument=file.read_text())
     return path
 
 

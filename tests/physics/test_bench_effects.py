@@ -66,7 +66,9 @@ GLASS = mueller.diattenuator(0.4, 1.0, 0.5) @ mueller.retarder(1.1, 0.8)
 def bench(configs, *faults):
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     read = TypeAdapter(tuple[AnyBenchEffect, ...]).validate_python
-    return Bench(FixedScene(GLASS), model, 662.0, SIDE, SIDE, flux_e_per_s=1e4, effects=read(faults)), model.at(662.0)
+    return Bench(
+        FixedScene(GLASS), model, 662.0, rows=SIDE, columns=SIDE, flux_e_per_s=1e4, effects=read(faults)
+    ), model.at(662.0)
 
 
 def series(made):

@@ -19,7 +19,7 @@ BEND = 0.03
 def test_a_bend_beside_other_faults_is_not_taken_for_several(configs: Path, tmp_path: Path) -> None:
     """A variance of the counts that is 2 % off, of 100 000 values, is more than most causes explain."""
     file = configs / "instruments/rgb950.yaml"
-    bench = declared_bench(InstrumentModel.load(file).at(NM), NM, PIXELS, False, 20_000.0)
+    bench = declared_bench(InstrumentModel.load(file).at(NM), NM, PIXELS, False, electrons=20_000.0)
     bench.transfer.append(lambda electrons: electrons * (1 - BEND * electrons / bench.full_well))
     bench.da += np.deg2rad(1.2)
     bench.path = (np.deg2rad(0.3), np.deg2rad(-0.4))

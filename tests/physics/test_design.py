@@ -34,7 +34,7 @@ def test_the_labs_own_table() -> None:
 
 
 def test_127_degrees_on_both_sides() -> None:
-    w = rows_of_design(40, 4.91, *BOTH_127, (0.0, 0.0, 0.0))
+    w = rows_of_design(40, 4.91, *BOTH_127, zeros_rad=(0.0, 0.0, 0.0))
     assert equally_weighted_variance(w) == pytest.approx(50.3, abs=0.05)
 
 
@@ -48,7 +48,7 @@ def test_ideal_rows_are_those_of_the_instrument_model() -> None:
     generator, analyzer = two_retarders(MODEL)
     w = MODEL.rows(rotating_retarders(0.1).angles_deg).reshape(40, 16)
     zeros = tuple(np.deg2rad([-17.02, 13.41, -0.53]))
-    own = rows_of_design(40, 4.91, np.deg2rad(127.12), np.deg2rad(94.78), zeros)
+    own = rows_of_design(40, 4.91, np.deg2rad(127.12), np.deg2rad(94.78), zeros_rad=zeros)
     np.testing.assert_allclose(own, w, atol=1e-14)
     assert (generator.axis, analyzer.axis) == ("psg", "psa")
 
@@ -73,10 +73,10 @@ def test_predicted_errors_of_every_element() -> None:
 
 
 def test_optimizing_finds_better_retardances_and_ratios() -> None:
-    (retardances,) = optimize(MODEL, NOISE, [40], {"retardances": True}, 4.91)
+    (retardances,) = optimize(MODEL, NOISE, [40], {"retardances": True}, ratio=4.91)
     assert retardances.ratio == 4.91
     assert retardances.score.equally_weighted_variance < 50.3
-    (ratio,) = optimize(MODEL, NOISE, [40], {"ratio": True}, 4.91)
+    (ratio,) = optimize(MODEL, NOISE, [40], {"ratio": True}, ratio=4.91)
     assert (ratio.generator_retardance_deg, ratio.analyzer_retardance_deg) == pytest.approx((127.12, 94.78))
     assert ratio.score.equally_weighted_variance < 86.3
     table = ratio.table(("psg", "psa"))
@@ -87,17 +87,17 @@ def test_optimizing_finds_better_retardances_and_ratios() -> None:
 
 
 def test_more_states_are_better() -> None:
-    designs = optimize(MODEL, NOISE, [24, 48], {"retardances": True}, 4.91)
+    designs = optimize(MODEL, NOISE, [24, 48], {"retardances": True}, ratio=4.91)
     assert [d.states for d in designs] == [24, 48]
     assert designs[1].score.equally_weighted_variance < designs[0].score.equally_weighted_variance
 
 
 def test_what_cannot_be_designed(configs: Path, tmp_path: Path) -> None:
     with pytest.raises(ProcessError, match="15 states cannot determine it"):
-        optimize(MODEL, NOISE, [15], {}, 4.91)
+        optimize(MODEL, NOISE, [15], {}, ratio=4.91)
     other = InstrumentModel.load(configs / "instruments/drr_imaging_630nm.yaml").at(630)
     with pytest.raises(ProcessError, match="turning elements: psa_retarder, analyzer"):
-        optimize(other, NOISE, [40], {}, 4.91)
+        optimize(other, NOISE, [40], {}, ratio=4.91)
     with pytest.raises(ProcessError, match="positive signal"):
         Noise(0, 3)
     table = tmp_path / "states.csv"

@@ -141,7 +141,7 @@ def test_a_shift_of_an_even_image_cannot_be_seen(configs, tmp_path):
         path = tmp_path / f"waves{waves:g}.h5"
         counts = digitize(bench, expose(bench, scene, angles), random)
         text = (configs / "instruments/rgb950.yaml").read_text()
-        write_capture(path, bench, counts, angles, Sample(kind="unknown"), text)
+        write_capture(path, bench, counts, angles, sample=Sample(kind="unknown"), instrument=text)
         return {name.partition(" ")[0].partition("[")[0] for name in diagnosed(path, configs).unobservable}
 
     shifts = {"image_drift", "beam_wander"}
@@ -174,7 +174,7 @@ def test_shifts_on_a_mosaic_are_told_in_pixels_of_the_sensor(configs, tmp_path):
     angles = {"psg": state_angles(16, True, False)["psg"]}
     counts = digitize(bench, expose(bench, Scene(random), angles), random)
     path = tmp_path / "capture.h5"
-    write_capture(path, bench, counts, angles, Sample(kind="unknown"), file.read_text())
+    write_capture(path, bench, counts, angles, sample=Sample(kind="unknown"), instrument=file.read_text())
     (effect,) = diagnose_captures([path], model)[0].diagnosis.effects
     assert effect.kind == "image_drift"
     for name, true in (("x", 1.2), ("y", -0.7)):

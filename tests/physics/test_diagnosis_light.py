@@ -35,7 +35,7 @@ def test_light_that_leaks_scatters_and_an_offset_does_not(configs, tmp_path, lea
     offset, leak = (next(c for c in problem.pool() if c.kind == kind) for kind in ("detector_offset", "psa_extinction"))
     # Either describes the counts: what is left is noise. The scatter knows which it is.
     there, value = (leak, np.array([0.1])) if leaks else (offset, np.array([80.0]))
-    gain = scatter_prefers(problem, Space((there,)), value, {offset: np.array([80.0])}, {})
+    gain = scatter_prefers(problem, Space((there,)), value, {offset: np.array([80.0])}, old={})
     assert gain < -NEEDED if leaks else gain > NEEDED
 
 
@@ -49,7 +49,7 @@ def test_counts_scatter_as_the_bend_says_that_made_them(configs, tmp_path, size)
     bend = next(c for c in problem.pool() if c.kind == "detector_nonlinearity")
     full_scale = data.conditions.full_scale * bench.gain
     value = np.array([size * full_scale / 10_000])
-    assert scatter_prefers(problem, Space((bend,)), value, {bend: value}, {}) > NEEDED
+    assert scatter_prefers(problem, Space((bend,)), value, {bend: value}, old={}) > NEEDED
 
 
 def test_what_a_fit_leaves_of_the_optics_is_no_noise(configs, tmp_path):
@@ -59,7 +59,7 @@ def test_what_a_fit_leaves_of_the_optics_is_no_noise(configs, tmp_path):
     problem = InstrumentProblem(model, [data], folds=1)
     offset = next(c for c in problem.pool() if c.kind == "detector_offset")
     # The plate is not in the fit, so much is left over. More light below black would scatter more, but nothing does.
-    assert scatter_prefers(problem, Space(()), np.zeros(0), {offset: np.array([-400.0])}, {}) < -NEEDED
+    assert scatter_prefers(problem, Space(()), np.zeros(0), {offset: np.array([-400.0])}, old={}) < -NEEDED
 
 
 @pytest.mark.parametrize("stated", [True, False])

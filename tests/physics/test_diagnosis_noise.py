@@ -35,7 +35,7 @@ def test_a_shift_of_noise_promises_nothing(noisy, moved):
     dc[0, FEATURES.index("dx")] = random.normal(size=STATES)
     dc[1, FEATURES.index("dyy")] = random.normal(size=STATES)
     sums, (block,) = Sums.empty(1, 2), moments.blocks
-    add_block(block, a, c, np.zeros((2, *a.shape)), dc, moments, sums)
+    add_block(block, a, c, np.zeros((2, *a.shape)), dc=dc, moments=moments, out=sums)
     # Derivatives share noise with neighbours: the excess varies up to twice as much as with independent values.
     assert abs(sums.excess[0]) < 5 * np.sqrt(2 * 2 * sums.freedom[0])
     error = np.sqrt(np.diag(sums.curvature[0]))
@@ -55,7 +55,7 @@ def test_neighbours_of_pure_noise_scatter_by_one_standard_deviation():
     for _ in range(100):
         left = np.tensordot(outside, random.normal(size=(rows, side, side)), 1).astype(np.float32)
         images = Images(left, np.ones_like(left), expected, np.ones((side, side), dtype=bool))
-        tests, _ = _tests(images, np.ones(rows), np.zeros((rows, 2)), 16, 1.0, noise_known=True)
+        tests, _ = _tests(images, np.ones(rows), np.zeros((rows, 2)), 16, spread=1.0, noise_known=True)
         found += [tests["neighbours, rows"], tests["neighbours, columns"]]
     assert np.std(found) == pytest.approx(1, abs=0.15)
 

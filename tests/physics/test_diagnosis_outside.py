@@ -23,7 +23,7 @@ STATES, PIXELS, NM = 40, 32, 662.0
 @pytest.fixture
 def bench(configs: Path) -> Bench:
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
-    return declared_bench(model, NM, PIXELS, False, 20_000.0)
+    return declared_bench(model, NM, PIXELS, False, electrons=20_000.0)
 
 
 def diagnosed(folder: Path, configs: Path, bench: Bench, drift_counts: float = 0.0) -> Diagnosis:
@@ -34,7 +34,7 @@ def diagnosed(folder: Path, configs: Path, bench: Bench, drift_counts: float = 0
     moved = np.round(np.linspace(0, drift_counts, STATES)).reshape(-1, *(1,) * (counts.ndim - 1))
     counts = (counts + moved).astype(counts.dtype)
     path = folder / "capture.h5"
-    write_capture(path, bench, counts, angles, Sample(kind="unknown"), file.read_text())
+    write_capture(path, bench, counts, angles, sample=Sample(kind="unknown"), instrument=file.read_text())
     return diagnose_captures([path], InstrumentModel.load(file))[0].diagnosis
 
 
@@ -123,7 +123,7 @@ def test_frames_that_are_read_with_the_next_ones_are_not_angles_of_an_axis(confi
 def test_a_lamp_that_drifts_while_the_machine_is_busy(configs, tmp_path):
     """The states come unevenly, and the host stamps them late: the camera's clock shows by how much."""
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
-    bench, random = declared_bench(model, NM, 96, False, 20_000.0), np.random.default_rng(7)
+    bench, random = declared_bench(model, NM, 96, False, electrons=20_000.0), np.random.default_rng(7)
     times = busy_machine(bench, random, STATES)
     bench.late_s = random.exponential(0.5, STATES)
     bench.level.append(lambda k, a: 1 + 0.1 * (times[k] - 0.5))

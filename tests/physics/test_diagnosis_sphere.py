@@ -38,7 +38,7 @@ def diagnosed(
 ) -> tuple[SurfaceDiagnosis, SurfaceProblem]:
     path = folder / "capture.h5"
     path.unlink(missing_ok=True)
-    take(path, fault, declared, NM, OMEGA_DEG, seed)
+    take(path, fault, declared, NM, omega_deg=OMEGA_DEG, seed=seed)
     judged, problem = diagnose_object([path], declared, fault.material, scene.object.geometry)
     return judged.diagnosis, problem
 
@@ -125,7 +125,7 @@ def test_an_index_where_little_is_polarized_has_an_honest_error(scene, configs, 
     declared = InstrumentModel.load(configs / "instruments/linear_stokes.yaml")
     fault = drawn("refractive_index", np.random.default_rng(5), scene, declared)
     path = tmp_path / "capture.h5"
-    take(path, fault, declared, NM, omega_deg, 3, light)
+    take(path, fault, declared, NM, omega_deg=omega_deg, seed=3, light=light)
     with Capture(path) as capture:
         data = read_surface(capture, declared.at(NM), scene.object.geometry, fault.material)
     problem = SurfaceProblem(declared.at(NM), [data])
@@ -144,7 +144,7 @@ def test_without_polarization_there_is_nothing_to_say(scene, configs, tmp_path):
         "white", Scene(scene.object.model_copy(update={"surface": white}), scene.material), declared, None
     )
     path = tmp_path / "capture.h5"
-    take(path, fault, declared, NM, OMEGA_DEG, 1)
+    take(path, fault, declared, NM, omega_deg=OMEGA_DEG, seed=1)
     with pytest.raises(ProcessError, match="no polarization stands out of the noise"):
         diagnose_object([path], declared, scene.material, scene.object.geometry)
 
@@ -172,7 +172,7 @@ def test_an_object_out_of_view_is_refused(scene, configs, tmp_path):
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     fault = drawn("none", np.random.default_rng(1), scene, declared)
     path = tmp_path / "capture.h5"
-    take(path, fault, declared, NM, OMEGA_DEG, 1)
+    take(path, fault, declared, NM, omega_deg=OMEGA_DEG, seed=1)
     geometry = scene.object.geometry
     far = geometry.shape.model_copy(update={"centre_mm": (400.0, 0.0, 0.0)})
     with pytest.raises(ProcessError, match="no pixel sees a lit point"):

@@ -71,7 +71,7 @@ def _tile_by_tile(problem, space, values):
     data, moments, model = problem.captures[0], problem.moments[0], problem.models[0]
     columns, changes_of = partial(tile_columns, model, data, moments), partial(problem.changes, 0, space)
     a, c = columns(changes_of(values)), problem.coefficients(0, changes_of(values))
-    da = slopes_of_rows(changes_of, model, data.conditions, space, values, a, columns)
+    da = slopes_of_rows(changes_of, model, data.conditions, space, values=values, a=a, columns=columns)
     dc = problem.slopes_of_counts(0, space, values, c)
     tiles, use = moments.tiles, moments.counts
     known, z, noise = features_of_tiles(data, moments, tiles, range(len(FEATURES)))
@@ -80,7 +80,7 @@ def _tile_by_tile(problem, space, values):
     curvature = np.zeros((2, space.size, space.size))
     for t, fold in enumerate(tiles.fold):
         one = slice(t, t + 1)
-        part = Projected(z[one], noise[one], a[one][:, use], c[None][:, :, use], around)
+        part = Projected(z[one], noise[one], a[one][:, use], c[None][:, :, use], around=around)
         excess[fold] += np.sum(part.residual**2) - part.expected.sum()
         told = part.slopes(da[:, one][:, :, use], dc[:, None][..., use])
         for total, of_one in zip((gradient, stretch, curvature), told, strict=True):

@@ -93,11 +93,11 @@ def test_tiles_that_are_all_alike_say_what_the_blocks_say(seen, shifted):
     da[:2] = random.normal(size=(2, *a.shape))
     blocks, tiles = Sums.empty(FOLDS_OF_TILES, 4), Sums.empty(FOLDS_OF_TILES, 4)
     for block in moments.blocks:
-        add_block(block, a, c, da, dc, moments, blocks)
+        add_block(block, a, c, da, dc=dc, moments=moments, out=blocks)
     count = moments.tiles.x.size
     none, counted = np.zeros(0, dtype=int), np.array([2, 3])
     slopes = TileSlopes(da[:, None], np.ones((1, count)), none, np.zeros((0, count, *a.shape)), counted, dc[counted])
-    add_tiles(data, moments, moments.tiles, np.broadcast_to(a, (count, *a.shape)), c, slopes, tiles)
+    add_tiles(data, moments, moments.tiles, np.broadcast_to(a, (count, *a.shape)), c=c, slopes=slopes, out=tiles)
     for name in ("excess", "freedom", "square", "count", "gradient", "curvature"):
         expected = getattr(blocks, name)
         assert getattr(tiles, name) == pytest.approx(expected, rel=1e-6, abs=1e-6 * np.abs(expected).max()), name

@@ -89,7 +89,7 @@ def found(bench: tuple[Space, np.ndarray, np.ndarray, np.ndarray], unlisted: flo
     _, groups = grouped(space, ())
     sums = problem.sums(space, start)
     noise = noise_of(problem, sums)
-    out = down_to_noise(problem, space, (), groups, start, noise, noise.unit(float(sums.excess.sum())))
+    out = down_to_noise(problem, space, (), groups, start=start, noise=noise, unit=noise.unit(float(sums.excess.sum())))
     if out is None:
         return None
     _, sets, state = out

@@ -30,8 +30,8 @@ def test_states_apart_are_what_a_column_for_each_of_them_says(cut_off):
     dc[3, FEATURES.index("square")] = random.normal(size=rows)
     of_state = np.arange(rows)[:, None] // CHANNELS == np.arange(STATES)
     together, apart = Sums.empty(1, VALUES), Sums.empty(1, VALUES)
-    add_block(block, np.where(of_state, a, 0.0), c, np.where(of_state, da, 0.0), dc, moments, together)
-    add_block(block, a, c, da, dc, moments, apart, apart=CHANNELS)
+    add_block(block, np.where(of_state, a, 0.0), c, np.where(of_state, da, 0.0), dc=dc, moments=moments, out=together)
+    add_block(block, a, c, da, dc=dc, moments=moments, out=apart, apart=CHANNELS)
     for name in sizes:
         expected = getattr(together, name)
         assert getattr(apart, name) == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max()), name
@@ -59,7 +59,9 @@ def test_states_apart_in_tiles_are_what_a_column_for_each_of_them_says():
             dc=dc,
         )
         out = Sums.empty(2, VALUES)
-        add_tiles(data, moments, moments.tiles, a * there, c, slopes, out, None if wide else CHANNELS)
+        add_tiles(
+            data, moments, moments.tiles, a * there, c=c, slopes=slopes, out=out, apart=None if wide else CHANNELS
+        )
         sums.append(out)
     for name in sizes:
         expected = getattr(sums[0], name)

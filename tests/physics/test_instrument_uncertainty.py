@@ -77,7 +77,7 @@ def products(synthetic_capture, tmp_path, model, truth, random, name="a", rows=4
     with Capture(path) as capture:
         reduce_mueller(capture, model, paths[0], (STEP,))
     quantities_of_mueller(paths[0], paths[1], STEP)
-    xi0_of_mueller(paths[0], paths[2], STEP, False, None)
+    xi0_of_mueller(paths[0], paths[2], STEP, False, progress=None)
     return paths
 
 
@@ -256,7 +256,7 @@ def test_compared_tables_share_the_error_of_one_instrument(configs):
         return made
 
     for other, expected in (("analyzer", 1.0), ("micropolarizer", np.hypot(3.0, 4.0))):
-        found = compare_on_sphere(table(0.5, 0.03, "analyzer"), table(0.6, 0.04, other), view, 35.0, (60, 60))
+        found = compare_on_sphere(table(0.5, 0.03, "analyzer"), table(0.6, 0.04, other), view, 35.0, shape=(60, 60))
         assert found["xi0_percent"] == pytest.approx(10)
         assert found["xi0_systematic_percent"] == pytest.approx(expected)
 
@@ -284,7 +284,7 @@ def test_an_extrapolated_matrix_and_its_quantities_have_the_instruments_part(con
         stokes, whole, maps = (tmp_path / f"{len(found)}.{kind}.h5" for kind in ("stokes", "m", "q"))
         with Capture(path) as capture:
             reduce_stokes(capture, used, stokes, (STEP,))
-        extrapolate_mueller(stokes, *scene, whole, STEP, False)
+        extrapolate_mueller(stokes, *scene, whole, step=STEP, overwrite=False)
         quantities_of_mueller(whole, maps, STEP)
         with Product(whole) as product, Product(maps) as derived:
             names = [n for n in derived.names if n.startswith("depolarization_index")]

@@ -110,7 +110,7 @@ def test_every_pixel_has_an_interval_of_its_degree_and_angle_of_polarization(
     one = np.ones((1, 1), np.float32)
     merged = MergedFrame(frame, np.zeros(size, np.uint8), one, one * np.float32(2.3**2))
     channels = demosaic(frame, LAYOUT, DEFAULT_METHOD)
-    found = stokes(channels, ANALYZERS, LAYOUT, DEFAULT_METHOD, merged, frame)
+    found = stokes(channels, ANALYZERS, LAYOUT, DEFAULT_METHOD, merged=merged, frame=frame)
     turn = (found["aolp_deg"] - np.rad2deg(np.arctan2(-0.8, 0.6)) / 2 + 90) % 180 - 90
     for name, error in {"dolp": found["dolp"] - polarized, "aolp_deg": turn}.items():
         if name == "aolp_deg" and not polarized:
@@ -135,7 +135,7 @@ def test_noise_of_an_adaptive_method_is_that_of_its_weights_there(method: str) -
         for _ in range(30)
     ]
     variance = np.full((4, *frame.shape), sigma**2, np.float32)
-    told = stokes_covariance(variance, LAYOUT, method, solve, frame.astype(np.float32))
+    told = stokes_covariance(variance, LAYOUT, method, solve, frame=frame.astype(np.float32))
     inner = np.s_[..., 10:-10, 10:-10]
     for k in range(3):
         found = np.var(np.stack([r[k] for r in runs]), axis=0, ddof=1)
@@ -168,7 +168,7 @@ def test_a_method_of_another_package_is_found_and_has_its_own_noise(monkeypatch)
         frame = (100 + 50 * x).astype(np.float32)
         variance = np.full((4, 24, 24), 9.0, np.float32)
         solve = np.linalg.pinv(ANALYZERS)
-        told = stokes_covariance(variance, LAYOUT, "larger", solve, frame)[:, 4:-4, 4:-4]
+        told = stokes_covariance(variance, LAYOUT, "larger", solve, frame=frame)[:, 4:-4, 4:-4]
         bilinear = stokes_covariance(variance, LAYOUT, "bilinear", solve)[:, 4:-4, 4:-4]
     demosaicing_methods.cache_clear()
     np.testing.assert_allclose(told, bilinear, rtol=1e-3, atol=1e-6)

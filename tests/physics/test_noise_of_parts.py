@@ -15,7 +15,7 @@ def test_noise_reaches_the_residual_through_the_fitted_image_where_a_feature_is_
     root = random.normal(size=(ROWS, FEATURES, FEATURES))
     noise, a = root @ root.transpose(0, 2, 1), random.normal(size=(ROWS, COLUMNS))
     z, c = random.normal(size=(FEATURES, ROWS, 4)), random.normal(size=(FEATURES, ROWS))
-    part = Projected(z[None], noise[None], a[None], c[None], around)
+    part = Projected(z[None], noise[None], a[None], c[None], around=around)
 
     hat = a @ np.linalg.pinv(a)
     outside = np.eye(ROWS) - hat

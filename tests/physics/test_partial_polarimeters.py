@@ -151,7 +151,9 @@ def test_xi0_comes_with_a_model_of_the_dominant_process(name, noisy, tmp_path, m
     with Capture(path) as capture:
         reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
     monkeypatch.setattr(maps, "dominant_model", lambda *_: np.tile(m0, (30, 40, 1, 1)))
-    maps.xi0_of_partial(tmp_path / "m.h5", "geometry", "material", tmp_path / "x.h5", Step("xi0", {}), False)
+    maps.xi0_of_partial(
+        tmp_path / "m.h5", "geometry", "material", tmp_path / "x.h5", step=Step("xi0", {}), overwrite=False
+    )
     with Product(tmp_path / "x.h5") as product:
         pulls = (product.get("xi0") - xi0) / product.get("xi0_errors")
     assert abs(pulls.mean()) < 5 / np.sqrt(pulls.size)
@@ -181,7 +183,9 @@ def test_polarized_light_gives_the_stokes_vector_that_is_sent_back_and_xi0(name,
     assert np.abs(pulls[:count].mean(axis=1)).max() < 5 / np.sqrt(pulls.shape[1])
     assert pulls[:count].std(axis=1) == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.shape[1]))
     monkeypatch.setattr(maps, "dominant_model", lambda *_: np.tile(m0, (30, 40, 1, 1)))
-    maps.xi0_of_partial(tmp_path / "m.h5", "geometry", "material", tmp_path / "x.h5", Step("xi0", {}), False)
+    maps.xi0_of_partial(
+        tmp_path / "m.h5", "geometry", "material", tmp_path / "x.h5", step=Step("xi0", {}), overwrite=False
+    )
     with Product(tmp_path / "x.h5") as product:
         pulls = (product.get("xi0") - xi0) / product.get("xi0_errors")
     assert pulls.std() == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.size))
@@ -321,7 +325,7 @@ def test_what_needs_the_whole_matrix_says_so(noisy, configs, tmp_path):
             reduce_mueller(capture, model, tmp_path / "p.h5", (Step("reduce", {}),), choice=Choice(physical="nearest"))
         reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
     with pytest.raises(ProductError, match="determines m00, m10, m20, and this needs all 16"):
-        xi0_of_mueller(tmp_path / "m.h5", tmp_path / "x.h5", Step("xi0", {}), False, None)
+        xi0_of_mueller(tmp_path / "m.h5", tmp_path / "x.h5", Step("xi0", {}), False, progress=None)
     for refused in (
         lambda: tabulate([tmp_path / "m.h5"], configs / "geometries/one_inch_sphere.yaml", "degree"),
         lambda: axostep_of_product(tmp_path / "m.h5", tmp_path / "m.cmmi", False),

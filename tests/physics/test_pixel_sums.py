@@ -36,7 +36,7 @@ def excess(a, data):
     c[0], c[FEATURES.index("square")], c[FEATURES.index("dx")] = 1.0, 1e-4, 1e-3
     sums = Sums.empty(2, 0)
     for block in moments.blocks:
-        add_block(block, a / moments.sigma[:, None], c, np.zeros((0, *a.shape)), None, moments, sums)
+        add_block(block, a / moments.sigma[:, None], c, np.zeros((0, *a.shape)), dc=None, moments=moments, out=sums)
     return moments, sums
 
 
@@ -87,7 +87,7 @@ def test_squares_are_averaged_while_they_are_read(configs, tmp_path, monkeypatch
     counts = digitize(bench, expose(bench, Scene(random), angles), random)
     counts[4, 8:9, 11:12] = 2**16 - 1
     text = (configs / "instruments/rgb950.yaml").read_text()
-    write_capture(tmp_path / "c.h5", bench, counts, angles, Sample(kind="unknown"), text)
+    write_capture(tmp_path / "c.h5", bench, counts, angles, sample=Sample(kind="unknown"), instrument=text)
     monkeypatch.setattr("processing.diagnosis.captured.read_capture.MOST_READ", counts.size / (side - 0.5) ** 2)
     with Capture(tmp_path / "c.h5") as capture:
         data = read_capture(capture, InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662))

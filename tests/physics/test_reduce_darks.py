@@ -72,7 +72,17 @@ def test_line_through_other_exposures_and_its_error() -> None:
 
 def bench(instrument: InstrumentModel, level: np.ndarray, flux: float, dark_current: float, mueller: np.ndarray):
     scene = FixedScene(np.broadcast_to(level[None, :, None, None] * mueller, (*SHAPE, 4, 4)))
-    return SimulatedBench(scene, instrument, 662, *SHAPE, DETECTOR, flux, dark_current, seed=3)
+    return SimulatedBench(
+        scene,
+        instrument,
+        662,
+        rows=SHAPE[0],
+        columns=SHAPE[1],
+        detector=DETECTOR,
+        flux_e_per_s=flux,
+        dark_current_e_per_s=dark_current,
+        seed=3,
+    )
 
 
 def bracketed(synthetic_capture, model: InstrumentModel, stand: SimulatedBench, dark_s: list, angles: dict, **header):
@@ -127,7 +137,7 @@ def test_bracketed_mosaic_uses_the_long_exposure_where_it_can(synthetic_capture,
     noise = NoiseModel.of(DETECTOR, integer=True)
     with Capture(path) as capture:
         merged = merge(capture, sample_states(capture), Correction.of(capture), noise)
-        reduce_stokes(capture, model.at(662), tmp_path / "s.h5", STEP, "superpixel")
+        reduce_stokes(capture, model.at(662), tmp_path / "s.h5", STEP, method="superpixel")
     layout = MosaicLayout.of(model.mosaic, [c.name for c in model.channels])
     truth = np.zeros(SHAPE)
     for k, (r, c) in enumerate(layout.offsets):

@@ -42,7 +42,7 @@ def test_pulls_of_means_have_unit_variance(method, block):
     channels = demosaic(frame, LAYOUT, method)
     s1 = np.tensordot(SOLVE[1], channels, axes=1)
     variance = np.maximum(channels, 0) + np.float32(READ**2)
-    stderr = np.sqrt(stokes_covariance(variance, LAYOUT, method, SOLVE, frame)[1])
+    stderr = np.sqrt(stokes_covariance(variance, LAYOUT, method, SOLVE, frame=frame)[1])
     correlation = neighbour_correlation(LAYOUT, method, tuple(map(tuple, SOLVE.tolist())))
     y, x = np.indices(s1.shape)
     bins = (y // block[0]) * 1000 + x // block[1]

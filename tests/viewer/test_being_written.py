@@ -30,7 +30,9 @@ def test_states_appear_as_they_are_written(lab, address):
     put_layout(
         partial,
         1 << 20,
-        lambda h5: create_layout(h5, header, angles, ("sample",) * 5, (6, 8), np.uint16, "2026-01-01T00:00:00"),
+        lambda h5: create_layout(
+            h5, header, angles, ("sample",) * 5, frame_shape=(6, 8), dtype=np.uint16, start_time="2026-01-01T00:00:00"
+        ),
     )
     # Open as a run has it: locked against every other program.
     with contextlib.closing(StateFile(partial)) as file:
@@ -58,7 +60,9 @@ def test_a_capture_that_is_sealed_while_somebody_reads_it_is_complete_afterwards
     put_layout(
         partial,
         1 << 20,
-        lambda h5: create_layout(h5, header, angles, ("sample",), (6, 8), np.uint16, "2026-01-01T00:00:00"),
+        lambda h5: create_layout(
+            h5, header, angles, ("sample",), frame_shape=(6, 8), dtype=np.uint16, start_time="2026-01-01T00:00:00"
+        ),
     )
     library = Library(lab)
     # HDF5 takes what it has of a file that is open already, whatever its name: a picture that is being read, say.

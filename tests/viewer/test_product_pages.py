@@ -151,7 +151,9 @@ def test_a_capture_and_a_product_are_not_compared(client, products):
 
 def test_a_fact_without_a_value_reads_as_on_the_console(client, lab):
     header = CaptureHeader(title="", simulated=True, mode="drr", wavelength_nm=662, detector=Detector())
-    with ProductWriter(lab / "p.h5", "mueller", header, (2, 3), {"valid": Plane((), "", "v", "u1")}, ()) as writer:
+    with ProductWriter(
+        lab / "p.h5", "mueller", header, (2, 3), planes={"valid": Plane((), "", "v", "u1")}, steps=()
+    ) as writer:
         writer.write(slice(0, 2), valid=np.ones((2, 3), np.uint8))
         writer.seal({"warnings": [], "median_reduced_chi_square": float("nan"), "darks": None})
     page = client.get("product?file=p.h5").text
@@ -166,7 +168,7 @@ def test_orientations_either_side_of_their_wrap_are_neighbours(name, period, cli
     header = CaptureHeader(title="", simulated=True, mode="drr", wavelength_nm=662, detector=Detector())
     planes = {name: Plane((), "degree", "an axis"), f"{name}_errors": Plane((), "degree", "its errors")}
     for file, angles in (("a", [1.0, period - 1.0]), ("b", [period - 1.0, 1.0])):
-        with ProductWriter(lab / f"{file}.h5", "quantities", header, (1, 2), planes, ()) as writer:
+        with ProductWriter(lab / f"{file}.h5", "quantities", header, (1, 2), planes=planes, steps=()) as writer:
             writer.write(slice(0, 1), **{name: np.array([angles]), f"{name}_errors": np.full((1, 2), 2.0)})
             writer.seal({"warnings": []})
     (_, _, apart, over), told = plane(client.get("/difference", params={"a": "a.h5", "b": "b.h5", "name": name}))
@@ -182,7 +184,7 @@ def test_an_angle_that_is_noise_has_no_colour(client, lab):
     header = CaptureHeader(title="", simulated=True, mode="stokes", wavelength_nm=662, detector=Detector())
     planes = {"aolp_deg": Plane((), "degree", "an angle"), "aolp_deg_errors": Plane((), "degree", "its errors")}
     for file, errors in (("some", [[1.0, np.nan]]), ("unknown", [[np.nan, np.nan]])):
-        with ProductWriter(lab / f"{file}.h5", "stokes", header, (1, 2), planes, ()) as writer:
+        with ProductWriter(lab / f"{file}.h5", "stokes", header, (1, 2), planes=planes, steps=()) as writer:
             writer.write(slice(0, 1), aolp_deg=np.array([[10.0, 120.0]]), aolp_deg_errors=np.array(errors))
             writer.seal({"warnings": []})
     shown = {
@@ -196,7 +198,7 @@ def test_an_angle_that_is_noise_has_no_colour(client, lab):
 def test_a_pixel_of_an_extrapolated_image_has_its_matrix_with_errors(client, lab):
     header = CaptureHeader(title="", simulated=True, mode="stokes", wavelength_nm=662, detector=Detector())
     mueller = np.diag([200.0, 100.0, 80.0, 60.0])[..., None, None].repeat(2, axis=-1)
-    with ProductWriter(lab / "e.h5", EXTRAPOLATED, header, (1, 2), PLANES, ()) as writer:
+    with ProductWriter(lab / "e.h5", EXTRAPOLATED, header, (1, 2), planes=PLANES, steps=()) as writer:
         writer.write(
             slice(0, 1),
             mueller=mueller,

@@ -49,7 +49,7 @@ def optimize_angles(
     for n, present in now.items():
         with progress_bar(f"{n} states", "starts") as tick:
             if given:
-                points = front(model, n, given, goal, "retardances" in names, tick)
+                points = front(model, n, given, goal, free_retardances="retardances" in names, progress=tick)
             else:
                 points = [Point(free_design(model, n, goal, "retardances" in names, progress=tick), float("nan"))]
         best = points[0].design

@@ -41,7 +41,7 @@ def diagnose_reflectance(
         ViewingGeometry.load(geometry),
     )
     with progress_line("diagnose", verbose) as say:
-        judged, problem = diagnose_object(captures, model, material, view, say)
+        judged, problem = diagnose_object(captures, model, material, view, say=say)
     show(judged.diagnosis, verbose, written=write is not None)
     _show_surface(judged.diagnosis)
     if json is not None:
@@ -52,7 +52,7 @@ def diagnose_reflectance(
         write_surface_report(report, judged, problem)
         typer.echo(str(report))
     if write is not None:
-        for path in write_surface(write, judged.diagnosis, material, view, model):
+        for path in write_surface(write, judged.diagnosis, material, view, instrument=model):
             typer.echo(str(path))
 
 

@@ -198,7 +198,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     noise = NoiseModel.of(detector, integer)
     if noise is not None:
         excess = correction.black.excess(noise, capture.column("exposure_s")[states])
-        floor = noise.averaged_floor(repeats, excess) + _of_black(capture, model, states, correction.black, noise)
+        floor = noise.averaged_floor(repeats, excess) + _of_black(capture, model, states, correction.black, noise=noise)
         slope, floor = noise.slope / repeats / top, floor / top**2
         data = replace(data, slope=slope / side**2, floor=floor / side**2, noise_known=True, noise_source=noise.source)
     stated = capture.sigma
@@ -213,7 +213,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
 
 
 def _of_black(
-    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], black: Black, noise: NoiseModel
+    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], black: Black, *, noise: NoiseModel
 ) -> Array:
     """Noise of each state (N,), counts^2, that leaves in a residual what the noise of the dark frames leaves there.
 

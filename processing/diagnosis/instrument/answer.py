@@ -226,7 +226,7 @@ def left_without(problem: InstrumentProblem, solved: Solution, effects: Collecti
 
 
 def told_effects(
-    problem: InstrumentProblem, solved: Solution, cause: Cause, doubt: str | None, not_applied: str | None
+    problem: InstrumentProblem, solved: Solution, cause: Cause, doubt: str | None, *, not_applied: str | None
 ) -> list[FoundEffect]:
     """A cause as it is told, given a reason to doubt it; one for each capture in which it shows."""
     without = left_without(problem, solved, (*cause.candidates, *cause.alternatives))
@@ -311,6 +311,7 @@ def correction(
     found: Posterior,
     solved: Solution,
     any_cause: bool,
+    *,
     judgement: Judgement,
     lasts: bool,
     used: Solution,
@@ -435,7 +436,7 @@ def missing(unseen: list[Candidate]) -> list[Candidate]:
 
 
 def capture_report(
-    problem: InstrumentProblem, k: int, solved: Solution, before: Residual, after: Residual
+    problem: InstrumentProblem, k: int, solved: Solution, before: Residual, *, after: Residual
 ) -> CaptureReport:
     data = problem.captures[k]
     sample = "unknown" if data.sample is None else "known up to a throughput for each pixel"

@@ -163,7 +163,7 @@ def names_of(outcome: Outcome) -> Names:
     named = tuple(c for c in likely if c not in untold)
     # What as many values as the data have took away may be any structure.
     left = outcome.left + sum(2 * c.log_odds * found.samples.best.unit for c in untold)
-    return Names(named, untold, doubts(asked, found, solved, named, left))
+    return Names(named, untold, doubts(asked, found, solved, named, left=left))
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: 
             *(
                 e
                 for c in names.named
-                for e in told_effects(asked, solved, c, worse or names.doubt.get(c), judgement.refused)
+                for e in told_effects(asked, solved, c, worse or names.doubt.get(c), not_applied=judgement.refused)
             ),
             *switched,
         ),
@@ -251,18 +251,20 @@ def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: 
         ),
         recommendation=wanted_for_evidence(problem)
         if verdict == "undetermined"
-        else recommended(problem, kept.space, kept.fit, names.rivals, missing(unseen)),
+        else recommended(problem, kept.space, kept.fit, names.rivals, unseen=missing(unseen)),
         unexplained=_unexplained(used, names) if verdict in ("unexplained", "partly_explained") else None,
         calibrated=calibrated(problem, found, kept),
         ranking=ranking(found, solved.before),
         captures=tuple(
-            capture_report(asked, k, kept, *of_one)
-            for k, of_one in enumerate(zip(used.before, used.after, strict=True))
+            capture_report(asked, k, kept, before, after=after)
+            for k, (before, after) in enumerate(zip(used.before, used.after, strict=True))
         ),
         instrument=problem.model.name,
         wavelengths_nm=tuple(sorted(set(problem.wavelengths_nm))),
         simulated=any(c.simulated for c in problem.captures),
-        correction=correction(problem, found, solved, any_cause, judgement, lasting, kept, errors),
+        correction=correction(
+            problem, found, solved, any_cause, judgement=judgement, lasts=lasting, used=kept, errors=errors
+        ),
         wiring=judgement.first,
         branch=used.bench.branch,
         left_out=not_measured(problem),

@@ -50,7 +50,7 @@ PART_OF_LEFT = "it may be a part of what is left unexplained"
 
 
 def doubts(
-    problem: InstrumentProblem, found: Posterior, solved: Solution, causes: Sequence[Cause], left: float
+    problem: InstrumentProblem, found: Posterior, solved: Solution, causes: Sequence[Cause], *, left: float
 ) -> dict[Cause, str]:
     """Reasons by cause; a cause without one may be called by its name. `left` is the chi-square of structure."""
     out: dict[Cause, str] = {}
@@ -58,7 +58,7 @@ def doubts(
     still = _standing(problem, solved, causes)
     even = Evenness(problem, solved.space, solved.fit.values)
     for cause in causes:
-        reason = STANDS if cause in still else _of_itself(problem, found, solved, cause, causes, even)
+        reason = STANDS if cause in still else _of_itself(problem, found, solved, cause, causes=causes, even=even)
         if reason is not None:
             out[cause] = reason
         if reason == OF_THE_SAMPLE:
@@ -90,6 +90,7 @@ def _of_itself(
     found: Posterior,
     solved: Solution,
     cause: Cause,
+    *,
     causes: Sequence[Cause],
     even: Evenness,
 ) -> str | None:

@@ -43,7 +43,7 @@ def at_edges(problem: InstrumentProblem, space: Space, values: Array, shifts: Se
     n = len(shifts)
     curvature, along, square, count, noise = np.zeros((n, n)), np.zeros(n), 0.0, 0, 0.0
     for k in range(len(problem.still)):
-        seen = _of_capture(problem, k, space, values, shifts)
+        seen = _of_capture(problem, k, space, values, shifts=shifts)
         if seen is not None:
             changes, left, expected = seen
             curvature += changes @ changes.T
@@ -63,7 +63,7 @@ def at_edges(problem: InstrumentProblem, space: Space, values: Array, shifts: Se
 
 
 def _of_capture(
-    problem: InstrumentProblem, k: int, space: Space, values: Array, shifts: Sequence[Sequence[Candidate]]
+    problem: InstrumentProblem, k: int, space: Space, values: Array, *, shifts: Sequence[Sequence[Candidate]]
 ) -> tuple[Array, Array, float] | None:
     """What each shift (S, P) would leave over at the edges of a capture, what is left (P,), and the square of noise.
 

@@ -182,7 +182,7 @@ def _searched(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate]
     ]
     wide = Space((*base.candidates, *free))
     values = np.concatenate([fit.values, np.zeros(wide.size - base.size)])
-    return wide.split(_best_start(problem, wide, values, fit.excess, STARTS))
+    return wide.split(_best_start(problem, wide, values, fit.excess, starts=STARTS))
 
 
 def best_of_starts(problem: InstrumentProblem, space: Space, starts: int, begin: Array | None = None) -> Fit:
@@ -191,7 +191,10 @@ def best_of_starts(problem: InstrumentProblem, space: Space, starts: int, begin:
     if fit.rms < FAR_OFF or not starts:
         return fit
     return minimize(
-        problem, space, _best_start(problem, space, fit.values, fit.excess, starts, NEAR_ENOUGH), expansions=0
+        problem,
+        space,
+        _best_start(problem, space, fit.values, fit.excess, starts=starts, enough=NEAR_ENOUGH),
+        expansions=0,
     )
 
 
@@ -200,6 +203,7 @@ def _best_start(
     space: Space,
     values: Array,
     best: float,
+    *,
     starts: int,
     enough: float = 0.0,
     free: BoolArray | None = None,
@@ -284,7 +288,9 @@ class _AtOne:
         fit = minimize(self.problem, self.space, np.zeros(self.space.size), free=self._large)
         values = fit.values
         if fit.rms > NEAR_ENOUGH:
-            values = _best_start(self.problem, self.space, values, fit.excess, STARTS, NEAR_ENOUGH, self._large)
+            values = _best_start(
+                self.problem, self.space, values, fit.excess, starts=STARTS, enough=NEAR_ENOUGH, free=self._large
+            )
         return self.space.split(values)
 
     def beside(self, start: Mapping[str, Array]) -> Values:

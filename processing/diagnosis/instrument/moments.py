@@ -155,7 +155,7 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     noise_floor = float(np.sqrt(np.mean(means.variance[counts]))) / mean
     seen = {part: pick for part, pick in picks.items() if pick.any()}
     return Moments(
-        blocks=_blocks(data, pixels, seen, folds * by_state, pixels.precision(abs(noise_floor))),
+        blocks=_blocks(data, pixels, seen, folds * by_state, kind=pixels.precision(abs(noise_floor))),
         tiles=tiles,
         clipped=clipped_tiles,
         counts=counts,
@@ -221,7 +221,12 @@ def _tiles(pixels: Pixels, pick: BoolArray, grid: _Grid, fold: NDArray[np.int64]
 
 
 def _blocks(
-    data: CaptureData, pixels: Pixels, picks: dict[tuple[int, bool], BoolArray], parts_of_states: int, kind: Precision
+    data: CaptureData,
+    pixels: Pixels,
+    picks: dict[tuple[int, bool], BoolArray],
+    parts_of_states: int,
+    *,
+    kind: Precision,
 ) -> tuple[Block, ...]:
     """Blocks of picks by fold and whether they are clipped; of so many parts of the states each, if any."""
     rows, size = len(pixels.u), len(FEATURES) * len(pixels.u)
@@ -233,12 +238,15 @@ def _blocks(
             root, noise = _square_root(sums[part][0]).reshape(len(FEATURES), rows, -1), sums[part][1]
         else:
             root, noise = features_of_pixels(pixels, pick)
-        out += _blocks_of(data, root, noise, *part, int(pick.sum()), parts_of_states)
+        fold, clipped = part
+        out += _blocks_of(
+            data, root, noise, fold, clipped=clipped, pixels=int(pick.sum()), parts_of_states=parts_of_states
+        )
     return tuple(out)
 
 
 def _blocks_of(
-    data: CaptureData, z: Array, noise: Array, fold: int, clipped: bool, pixels: int, parts_of_states: int
+    data: CaptureData, z: Array, noise: Array, fold: int, *, clipped: bool, pixels: int, parts_of_states: int
 ) -> list[Block]:
     counts = _square_root(z[0] @ z[0].T)
     use = data.row_counts

@@ -50,7 +50,7 @@ def mueller_slopes(
         columns = partial(_all_columns, problem, k)
         w, c = columns(changes), problem.coefficients(k, changes)
         u, size, vt = _decomposed(w * moments.counts[:, None])
-        dw, dc = problem.slopes(k, mine, own, w, columns), problem.slopes_of_counts(k, mine, own, c)
+        dw, dc = problem.slopes(k, mine, own, w, columns=columns), problem.slopes_of_counts(k, mine, own, c)
         scale = 1 / moments.sigma[:, None]
         for block in moments.blocks[:: problem.folds if moments.tiles is None else 1]:
             y = np.einsum("fl,flr->lr", c, block.z) * scale

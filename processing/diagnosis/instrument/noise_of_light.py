@@ -24,7 +24,7 @@ from processing.diagnosis.search.space import Space
 Undone = Mapping[Candidate, Array]
 
 
-def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new: Undone, old: Undone) -> float:
+def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new: Undone, *, old: Undone) -> float:
     """Log likelihood of the residual with the noise of the counts that `new` undoes, over that with `old`.
 
     The residual is that of the captures at `values` (K,), the same in both. Of many pixels the noise's own error
@@ -45,7 +45,7 @@ def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new
             rest /= np.broadcast_to(slope, still.signal.shape).reshape(rest.shape)
         share, good = free * near.moments[k].left, data.usable & ~data.clipped
         before, after = (
-            _log_scatter(still, rest, share, near.moments[k].counts, good, undoing(still, undone))
+            _log_scatter(still, rest, share, near.moments[k].counts, good=good, correct=undoing(still, undone))
             for undone in (old, new)
         )
         gain += 0.5 * (before - after)
@@ -54,7 +54,7 @@ def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new
 
 
 def _log_scatter(
-    still: CaptureData, rest: NDArray[np.float32], share: Array, use: BoolArray, good: BoolArray, correct: Correct
+    still: CaptureData, rest: NDArray[np.float32], share: Array, use: BoolArray, *, good: BoolArray, correct: Correct
 ) -> float:
     """Minus twice the log likelihood of the scatter of a residual (L, rows, columns), with noise of corrected counts.
 

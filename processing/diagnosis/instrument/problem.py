@@ -65,6 +65,7 @@ class InstrumentProblem:
         captures: Sequence[CaptureData],
         undone: Mapping[Candidate, Array] | None = None,
         folds: int | None = None,
+        *,
         moved_back: bool = False,
     ) -> None:
         self.undone = dict(undone or {})
@@ -320,9 +321,9 @@ class InstrumentProblem:
             part = Sums.empty(self.folds, mine.size if derivatives else 0)
             changes = self.changes(k, mine, own)
             if changes.field_retardance_rad or (derivatives and self._has_field(mine)):
-                self._tile_sums(k, mine, own, changes, part, derivatives)
+                self._tile_sums(k, mine, own, changes, out=part, derivatives=derivatives)
             else:
-                self._block_sums(k, mine, own, changes, part, derivatives)
+                self._block_sums(k, mine, own, changes, out=part, derivatives=derivatives)
             out.add(k, part, acting, float(self.weights[k]))
         return out
 
@@ -367,12 +368,14 @@ class InstrumentProblem:
     def _has_field(self, space: Space) -> bool:
         return any(isinstance(c.effect, FieldEffect) for c in space.candidates)
 
-    def _block_sums(self, k: int, space: Space, values: Array, changes: Changes, out: Sums, derivatives: bool) -> None:
+    def _block_sums(
+        self, k: int, space: Space, values: Array, changes: Changes, *, out: Sums, derivatives: bool
+    ) -> None:
         # With a level of the source in every state each state is projected by itself: one column serves all of them.
         a, c = self._columns_of_one_source(k, changes), self.coefficients(k, changes)
         da, dc = np.zeros((0, *a.shape)), None
         if derivatives:
-            da = self.slopes(k, space, values, a, partial(self._columns_of_one_source, k))
+            da = self.slopes(k, space, values, a, columns=partial(self._columns_of_one_source, k))
             dc = self.slopes_of_counts(k, space, values, c)
         for block in self.moments[k].blocks:
             if block.clipped and changes.drop_clipped:
@@ -381,18 +384,22 @@ class InstrumentProblem:
                     continue
                 block = replace(block, rows=block.sound)
             if block.rows.size:
-                add_block(block, a, c, da, dc, self.moments[k], out, self._rows_apart(k))
+                add_block(block, a, c, da, dc=dc, moments=self.moments[k], out=out, apart=self._rows_apart(k))
 
-    def slopes(self, k: int, space: Space, values: Array, a: Array, columns: Columns) -> Array:
+    def slopes(self, k: int, space: Space, values: Array, a: Array, *, columns: Columns) -> Array:
         """Derivatives (values, ..., L, K) of the rows a (..., L, K) of a capture, which `columns` makes of changes."""
         conditions = self.captures[k].conditions
-        return slopes_of_rows(partial(self.changes, k, space), self.models[k], conditions, space, values, a, columns)
+        return slopes_of_rows(
+            partial(self.changes, k, space), self.models[k], conditions, space, values=values, a=a, columns=columns
+        )
 
     def slopes_of_counts(self, k: int, space: Space, values: Array, c: Array) -> Array:
         """Derivatives (values, F, L) of the coefficients c (F, L) of the corrected counts of a capture."""
-        return slopes_of_counts(partial(self.changes, k, space), partial(self.coefficients, k), space, values, c)
+        return slopes_of_counts(partial(self.changes, k, space), partial(self.coefficients, k), space, values, c=c)
 
-    def _tile_sums(self, k: int, space: Space, values: Array, changes: Changes, out: Sums, derivatives: bool) -> None:
+    def _tile_sums(
+        self, k: int, space: Space, values: Array, changes: Changes, *, out: Sums, derivatives: bool
+    ) -> None:
         """The same with another A in every tile of the image."""
         data, moments = self.captures[k], self.moments[k]
         if moments.tiles is None:
@@ -403,9 +410,11 @@ class InstrumentProblem:
         a, c, slopes = tile_columns(model, data, moments, changes), self.coefficients(k, changes), None
         if derivatives and space.size:
             dc = self.slopes_of_counts(k, space, values, c)
-            slopes = slopes_of_tiles(model, data, moments, partial(self.changes, k, space), space, values, a, dc)
+            slopes = slopes_of_tiles(
+                model, data, moments, partial(self.changes, k, space), space=space, values=values, a=a, dc=dc
+            )
         for each in tiles:
-            add_tiles(data, moments, each, a, c, slopes, out, self._rows_apart(k))
+            add_tiles(data, moments, each, a, c=c, slopes=slopes, out=out, apart=self._rows_apart(k))
 
 
 def _moved_back(captures: Sequence[CaptureData], shifts_px: Sequence[Array]) -> tuple[CaptureData, ...]:

@@ -29,7 +29,7 @@ class NoiseOfParts:
     of_features : (T, F, L) mean product of the residual's noise with that of each feature, as it reaches each row.
     """
 
-    def __init__(self, noise: Array, q: Array, outside: Array, c: Array, around: NDArray[np.bool_]) -> None:
+    def __init__(self, noise: Array, q: Array, outside: Array, c: Array, *, around: NDArray[np.bool_]) -> None:
         """noise (T, L, F, F), q (T, L, K), outside P (T, L, L), c (T or 1, F, L); `around` (F,): the derivatives."""
         self._noise, self._q, self._outside = noise, q, outside
         self._plain, self._around = np.flatnonzero(~around), np.flatnonzero(around)
@@ -109,7 +109,15 @@ def add_response(counts: NDArray[Any], coefficients: Array, a: Array) -> NDArray
 
 
 def add_block(
-    block: Block, a: Array, c: Array, da: Array, dc: Array | None, moments: Moments, out: Sums, apart: int | None = None
+    block: Block,
+    a: Array,
+    c: Array,
+    da: Array,
+    *,
+    dc: Array | None,
+    moments: Moments,
+    out: Sums,
+    apart: int | None = None,
 ) -> None:
     """Add what a block says of rows a (L, K) and coefficients c (F, L), with their derivatives by each value.
 
@@ -127,9 +135,9 @@ def add_block(
             noise / (sigma**2)[:, :, None, None],
             a[rows],
             c[used][:, rows].swapaxes(0, 1),
-            around,
+            around=around,
         )
-        add_parts(part, moments, rows, np.full(len(rows), float(block.pixels)), block.fold, out)
+        add_parts(part, moments, rows, np.full(len(rows), float(block.pixels)), fold=block.fold, out=out)
         if len(da):
             gradient, stretch, curvature = part.slopes(da[:, rows], dc[:, used][:, :, rows].swapaxes(1, 2))
             out.gradient[block.fold] += gradient
@@ -155,7 +163,7 @@ class Projected:
     unknowns : (T, R, K) A+ y, turned over.
     """
 
-    def __init__(self, z: Array, noise: Array, a: Array, c: Array, around: NDArray[np.bool_]) -> None:
+    def __init__(self, z: Array, noise: Array, a: Array, c: Array, *, around: NDArray[np.bool_]) -> None:
         """z (T, F, L, R), noise (T, L, F, F), a (T, L, K), c (T or 1, F, L); `around` (F,): which are derivatives."""
         u, size, vt = np.linalg.svd(a, full_matrices=False)
         keep = size > RANK * size[:, :1]
@@ -163,7 +171,7 @@ class Projected:
         # A+, turned over.
         self._back = q * np.where(keep, 1 / np.maximum(size, 1e-300), 0.0)[:, None, :] @ vt
         self.outside = np.eye(a.shape[1]) - q @ q.transpose(0, 2, 1)
-        self._noise = NoiseOfParts(noise, q, self.outside, c, around)
+        self._noise = NoiseOfParts(noise, q, self.outside, c, around=around)
         self._z = z
         if around.any():
             self._z = z.copy()
@@ -216,7 +224,7 @@ class Projected:
 
 
 def add_parts(
-    parts: Projected, moments: Moments, rows: NDArray[np.int64], pixels: NDArray[np.floating], fold: int, out: Sums
+    parts: Projected, moments: Moments, rows: NDArray[np.int64], pixels: NDArray[np.floating], *, fold: int, out: Sums
 ) -> None:
     """Add what parts of one fold leave.
 

@@ -34,14 +34,15 @@ def recommended(
     space: Space,
     fit: Fit,
     sets: Sequence[Sequence[Candidate]],
+    *,
     unseen: Sequence[Candidate],
 ) -> str:
     """What to capture next: for every set that cannot be told apart, else to show what is unseen."""
-    return " ".join(dict.fromkeys(_capture(problem, space, fit, rivals, unseen) for rivals in sets or ((),)))
+    return " ".join(dict.fromkeys(_capture(problem, space, fit, rivals, unseen=unseen) for rivals in sets or ((),)))
 
 
 def _capture(
-    problem: InstrumentProblem, space: Space, fit: Fit, rivals: Sequence[Candidate], unseen: Sequence[Candidate]
+    problem: InstrumentProblem, space: Space, fit: Fit, rivals: Sequence[Candidate], *, unseen: Sequence[Candidate]
 ) -> str:
     """One sentence: the capture that separates the rivals, or shows the unseen, or that none of the usual does."""
     rows_side = [c for c in rivals if not isinstance(c.effect, CountsEffect) and isinstance(c.effect, InstrumentEffect)]
@@ -50,7 +51,7 @@ def _capture(
     for name, sample in SAMPLES.items():
         if any(h is not None and np.allclose(h / np.abs(h).max(), sample.reshape(16) / sample.max()) for h in have):
             continue
-        value = _power(problem, space, fit, sample, rows_side, unseen)
+        value = _power(problem, space, fit, sample, rivals=rows_side, unseen=unseen)
         # A simpler sample is preferred unless another one tells clearly more.
         if value > power + CLEARLY_MORE:
             best, power = name, value
@@ -75,21 +76,22 @@ def _power(
     space: Space,
     fit: Fit,
     sample: Array,
+    *,
     rivals: Sequence[Candidate],
     unseen: Sequence[Candidate],
 ) -> float:
-    signatures = [_signature(problem, space, fit, sample.reshape(16), c) for c in rivals]
+    signatures = [_signature(problem, space, fit, sample.reshape(16), candidate=c) for c in rivals]
     value = 1.0
     for i, first in enumerate(signatures):
         for second in signatures[i + 1 :]:
             value = min(value, _sine(first, second))
     if rivals:
         return value if len(rivals) > 1 else 1.0
-    seen = [np.linalg.norm(_signature(problem, space, fit, sample.reshape(16), c)) > VISIBLE for c in unseen]
+    seen = [np.linalg.norm(_signature(problem, space, fit, sample.reshape(16), candidate=c)) > VISIBLE for c in unseen]
     return float(np.mean(seen)) if seen else 0.0
 
 
-def _signature(problem: InstrumentProblem, space: Space, fit: Fit, sample: Array, candidate: Candidate) -> Array:
+def _signature(problem: InstrumentProblem, space: Space, fit: Fit, sample: Array, *, candidate: Candidate) -> Array:
     """Change (L, parameters) of the relative signal for typical sizes, the throughput projected out."""
     capture = next(k for k, w in enumerate(problem.wavelengths_nm) if candidate.acts(k, w))
     data = problem.captures[capture]

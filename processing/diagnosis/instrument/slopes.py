@@ -33,6 +33,7 @@ def slopes_of_rows(
     model: InstrumentModel,
     conditions: Conditions,
     space: Space,
+    *,
     values: Array,
     a: Array,
     columns: Columns,
@@ -74,7 +75,7 @@ def slopes_of_rows(
 
 
 def slopes_of_counts(
-    changes_of: ChangesOf, coefficients: Callable[[Changes], Array], space: Space, values: Array, c: Array
+    changes_of: ChangesOf, coefficients: Callable[[Changes], Array], space: Space, values: Array, *, c: Array
 ) -> Array:
     """Derivatives (values, F, L) of the coefficients c (F, L) of the corrected counts."""
     dc = np.zeros((space.size, *c.shape))

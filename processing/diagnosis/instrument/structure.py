@@ -116,7 +116,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     good = np.asarray(np.isfinite(r).all(axis=0))
     images = Images(r, around, expected, good)
     alike = _alike(data)
-    tests, left = _tests(images, moments.left, alike, a.shape[1], moments.spread, data.noise_known)
+    tests, left = _tests(images, moments.left, alike, a.shape[1], spread=moments.spread, noise_known=data.noise_known)
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
     states = mean.reshape(n, channels).mean(axis=1)
@@ -183,6 +183,7 @@ def _tests(
     shown: Array,
     alike: Array,
     columns: int,
+    *,
     spread: float,
     noise_known: bool,
 ) -> tuple[dict[str, float], float]:

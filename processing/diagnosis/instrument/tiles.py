@@ -183,6 +183,7 @@ def slopes_of_tiles(
     data: CaptureData,
     moments: Moments,
     changes_of: ChangesOf,
+    *,
     space: Space,
     values: Array,
     a: Array,
@@ -194,7 +195,9 @@ def slopes_of_tiles(
     changes, conditions = changes_of(values), data.conditions
     columns = partial(columns_at_nodes, model, data, moments)
     apart = CountsEffect, FieldEffect
-    at_nodes = slopes_of_rows(changes_of, model, conditions, space, values, columns(changes), columns, apart)
+    at_nodes = slopes_of_rows(
+        changes_of, model, conditions, space, values=values, a=columns(changes), columns=columns, leave_out=apart
+    )
     fields = {
         part.start + j: (tile_columns(model, data, moments, changes_of(moved)) - a) / step
         for candidate, part in fitted(space)
@@ -229,7 +232,7 @@ def add_slopes(parts: Iterable[tuple[NDArray[np.int64], Projected]], slopes: Til
         for total, by_rows in zip((of_excess, of_noise), part.by_rows, strict=True):
             total += np.tensordot(shares, by_rows, axes=1)
         if own.size:
-            moved = _add_own(some, part, slopes, fold, out)
+            moved = _add_own(some, part, slopes, fold, out=out)
             across += shares @ (moved @ part.unknowns).swapaxes(0, 1).reshape(len(some), -1)
     flat = slopes.at_nodes.reshape(len(slopes.at_nodes), -1)
     out.gradient[fold] += flat @ of_excess.reshape(-1)
@@ -243,7 +246,7 @@ def add_slopes(parts: Iterable[tuple[NDArray[np.int64], Projected]], slopes: Til
         out.curvature[fold] += _curvature(slopes.at_nodes, shares, np.concatenate(outside), np.concatenate(power))
 
 
-def _add_own(some: NDArray[np.int64], part: Projected, slopes: TileSlopes, fold: int, out: Sums) -> Array:
+def _add_own(some: NDArray[np.int64], part: Projected, slopes: TileSlopes, fold: int, *, out: Sums) -> Array:
     """Add what fields and counts tell by themselves; what (J + C, T, L, R) they do to the residual."""
     fields, counted = slopes.fields, slopes.counted
     da, dc, own = slopes.da[:, some], slopes.dc[:, None], np.concatenate([fields, counted])
@@ -282,6 +285,7 @@ def add_tiles(
     moments: Moments,
     tiles: Tiles,
     a: Array,
+    *,
     c: Array,
     slopes: TileSlopes | None,
     out: Sums,
@@ -303,8 +307,8 @@ def add_tiles(
         here = np.flatnonzero(tiles.fold == fold)
         for some in np.split(here, range(TILES_TOGETHER, here.size, TILES_TOGETHER)):
             features = z[some[:, None], mine, kept]
-            part = Projected(features, scatter[some], a[some][:, rows], c[None, used][:, :, rows], around)
-            add_parts(part, moments, rows[None], tiles.pixels[some], fold, out)
+            part = Projected(features, scatter[some], a[some][:, rows], c[None, used][:, :, rows], around=around)
+            add_parts(part, moments, rows[None], tiles.pixels[some], fold=fold, out=out)
             yield some, part
 
     for kept in _together(use, apart):

@@ -77,5 +77,5 @@ class Evenness:
             noise,
             np.broadcast_to(rows, (tiles.x.size, *rows.shape)),
             c[None, used][:, :, use],
-            used >= len(FEATURES) - DERIVATIVES,
+            around=used >= len(FEATURES) - DERIVATIVES,
         )

@@ -205,7 +205,7 @@ class WholeBench:
         """Corrections of the counts that the noise speaks against, with the log likelihood that they lose."""
         undone = exactly_undone(space, values, pointwise=True)
         far = {c: v for c, v in undone.items() if np.any(np.abs(v) > EXACT * c.typical)}
-        gains = {c: scatter_prefers(self.whole, space, values, {c: v}, {}) for c, v in far.items()}
+        gains = {c: scatter_prefers(self.whole, space, values, {c: v}, old={}) for c, v in far.items()}
         return {c: gain for c, gain in gains.items() if gain < -NEEDED}
 
     def _unknowns(self, k: int) -> int:
@@ -280,7 +280,7 @@ class WholeBench:
         self, candidates: Sequence[Candidate], fixed: Sequence[Candidate], old: Posterior | None = None
     ) -> Posterior:
         space = Space(tuple(candidates))
-        return posterior(self.whole, space, fixed, self._values_at_start(space, old), self.say)
+        return posterior(self.whole, space, fixed, self._values_at_start(space, old), say=self.say)
 
     def _values_at_start(self, space: Space, old: Posterior | None = None) -> Array:
         start = dict(self._start)

@@ -33,7 +33,7 @@ FIRST_DAMPING = 1e-3
 
 
 def all_at_once(
-    problem: Problem, space: Space, fixed: Sequence[Candidate], x: Array, noise: Noise, tau: float
+    problem: Problem, space: Space, fixed: Sequence[Candidate], x: Array, *, noise: Noise, tau: float
 ) -> Array:
     """Values (K,) with every group there and `tau` typical sizes wide, but those that are one of many alternatives."""
     chosen = [k for k, c in enumerate(space.candidates) if not c.state_chosen and not c.price]
@@ -54,10 +54,10 @@ def all_at_once(
     return out
 
 
-def next_values(problem: Problem, space: Space, sets: Sets, state: State, x: Array) -> tuple[Array, bool]:
+def next_values(problem: Problem, space: Space, sets: Sets, state: State, *, x: Array) -> tuple[Array, bool]:
     """Values (K,) about which to linearize next, and whether they are so near to x (K,) that there is no need."""
     samples = sample(sets, state, SAMPLES_BEFORE)
-    new = improved(problem, space, sets.groups, samples, [mean_over_sets(space, samples, x), x])
+    new = improved(problem, space, sets.groups, samples, starts=[mean_over_sets(space, samples, x), x])
     spread = np.sqrt(np.maximum(np.diag(samples.covariance), 1e-12)) * space.joined("typical")
     return new, bool(np.all(np.abs(new - x) < SETTLED * spread))
 
@@ -73,6 +73,7 @@ def improved(
     space: Space,
     groups: Sequence[Group],
     samples: Samples,
+    *,
     starts: Sequence[Array],
     steps: int = STEPS,
 ) -> Array:
@@ -89,7 +90,7 @@ def improved(
         places = [x[positions] for x in starts]
         left = [_penalized(problem.sums(part, x, derivatives=False), weak, x) for x in places]
         best = int(np.argmin(np.nan_to_num(left, nan=np.inf)))
-        out[positions] = descend(problem, part, places[best], weak, steps)
+        out[positions] = descend(problem, part, places[best], weak, steps=steps)
     return out
 
 
@@ -121,7 +122,7 @@ def _penalized(sums: Sums, weak: Array, values: Array, reference: float | None =
     return float(sums.excess.sum() * (freedom if reference is None else reference) / freedom + weak @ values**2)
 
 
-def descend(problem: Problem, space: Space, x: Array, weak: Array, steps: int = STEPS) -> Array:
+def descend(problem: Problem, space: Space, x: Array, weak: Array, *, steps: int = STEPS) -> Array:
     """Values at the minimum of chi-square over its stretch, plus weak . x^2, near x (Levenberg-Marquardt, bounds)."""
     lower, upper = space.joined("lower"), space.joined("upper")
     problem.relinearize(space, x)

@@ -27,6 +27,7 @@ def down_to_noise(
     space: Space,
     fixed: Sequence[Candidate],
     groups: Sequence[Group],
+    *,
     start: Array,
     noise: Noise,
     unit: float,
@@ -38,7 +39,7 @@ def down_to_noise(
     start : (K,) values to begin with.
     noise, unit : of chi-square where structure was left; every round has to leave less than `MOSTLY` of it, or `BENT`.
     """
-    x, settled = all_at_once(problem, space, fixed, start, noise, EXACT), False
+    x, settled = all_at_once(problem, space, fixed, start, noise=noise, tau=EXACT), False
     for left in reversed(range(ROUNDS)):
         problem.relinearize(space, x)
         sums = problem.sums(space, x)
@@ -53,7 +54,7 @@ def down_to_noise(
         state = likely_set(sets)
         if settled or not left:
             break
-        x, settled = next_values(problem, space, sets, state, x)
+        x, settled = next_values(problem, space, sets, state, x=x)
     if unit > BENT:
         return None
     sets = Sets(form, groups, Noise(True, full.directions, floor=unit))

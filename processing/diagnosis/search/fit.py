@@ -66,6 +66,7 @@ def minimize(
     space: Space,
     start: Array,
     folds: Sequence[int] | None = None,
+    *,
     free: NDArray[np.bool_] | None = None,
     steps: int = STEPS,
     expansions: int = EXPANSIONS,
@@ -80,12 +81,12 @@ def minimize(
     if folds is None and expansions:
         problem.relinearize(space, start)
     weak = prior(space) if weak is None else weak
-    fit = _descend(problem, space, start, folds, free, steps, least_gain, weak)
+    fit = _descend(problem, space, start, folds, free=free, steps=steps, least_gain=least_gain, weak=weak)
     if folds is None:
         for _ in range(expansions):
             if not problem.relinearize(space, fit.values):
                 break
-            fit = _descend(problem, space, fit.values, folds, free, steps, least_gain, weak)
+            fit = _descend(problem, space, fit.values, folds, free=free, steps=steps, least_gain=least_gain, weak=weak)
     return fit
 
 
@@ -94,6 +95,7 @@ def _descend(
     space: Space,
     start: Array,
     folds: Sequence[int] | None,
+    *,
     free: NDArray[np.bool_] | None,
     steps: int,
     least_gain: float,
@@ -220,7 +222,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
             values = minimize(problem, space, full.values, others, steps=FEW_STEPS).values
         else:
             values = _one_step(full, space, others, weak)
-            if _worse(problem, space, full, values, others, weak):
+            if _worse(problem, space, full, values, folds=others, weak=weak):
                 # The least certain values moved farther than one step can tell.
                 least = max(LEAST_GAIN, HELD_OUT_RELATIVE * abs(full.excess))
                 fit = minimize(problem, space, full.values, others, steps=MANY_STEPS, least_gain=least, weak=weak)
@@ -273,7 +275,7 @@ def _in_sample(space: Space, full: Fit, weak: Array) -> HeldOut:
     return HeldOut(excess, max(share * freedom, 1e-300), square, max(share * count, 1e-300), shares)
 
 
-def _worse(problem: Problem, space: Space, full: Fit, values: Array, folds: Sequence[int], weak: Array) -> bool:
+def _worse(problem: Problem, space: Space, full: Fit, values: Array, *, folds: Sequence[int], weak: Array) -> bool:
     """Whether the data of these folds and the prior are fitted worse than by the fit to all of them."""
     new = problem.sums(space, values, derivatives=False)
     gain = full.sums.excess[folds].sum() - new.excess[folds].sum() + weak @ (full.values**2 - values**2)

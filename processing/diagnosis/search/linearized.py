@@ -60,7 +60,7 @@ def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic
     h = sums.curvature.sum(axis=0) * np.outer(typical, typical)
     h = h - np.outer(g, a) - np.outer(a, g) + (excess - freedom) * np.outer(a, a)
     g = g - excess * a
-    told = _told(problem, space, x, h, typical)
+    told = _told(problem, space, x, h, typical=typical)
     h, g = h * np.outer(told, told), g * told
     excess, g, h = _whatever(np.sqrt(problem.time_noise(space, x)) / typical, excess, g, h)
     value, vector = np.linalg.eigh(h)
@@ -78,7 +78,7 @@ def _whatever(sigma: Array, excess: float, g: Array, h: Array) -> tuple[float, A
     return float(excess - g[there] @ own @ g[there]), g - across @ own @ g[there], h - across @ own @ across.T
 
 
-def _told(problem: Problem, space: Space, x: Array, h: Array, typical: Array) -> Array:
+def _told(problem: Problem, space: Space, x: Array, h: Array, *, typical: Array) -> Array:
     """Share (K,) of the curvature that is not noise of image derivatives."""
     noise = np.diag(problem.noise_information(space, x)) * typical**2
     return np.asarray(np.clip(1 - noise / np.maximum(np.diag(h), 1e-300), 0.0, 1.0))

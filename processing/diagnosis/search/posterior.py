@@ -85,7 +85,7 @@ class Posterior:
         return self.space.candidates[self.members[group][0]]
 
 
-def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start: Array, say: Say) -> Posterior:
+def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start: Array, *, say: Say) -> Posterior:
     """The posterior of all values of a space.
 
     Parameters
@@ -95,10 +95,10 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     """
     members, groups = grouped(space, fixed)
     bends = [g for g, own in enumerate(members) if isinstance(space.candidates[own[0]].effect, PointwiseEffect)]
-    about, sets, state, others = _found(problem, space, fixed, groups, start, bends)
+    about, sets, state, others = _found(problem, space, fixed, groups, start=start, bends=bends)
     if problem.noise_known and state.unit > BENT:
         say("structure is left: once more, with every intensity counted in full")
-        explained = down_to_noise(problem, space, fixed, groups, start, sets.noise, state.unit)
+        explained = down_to_noise(problem, space, fixed, groups, start=start, noise=sets.noise, unit=state.unit)
         if explained is None:
             problem.relinearize(space, about)
         else:
@@ -106,7 +106,7 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     samples = _averaged(sets, state)
     there = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(there) or 'nothing'}; unit of chi-square {state.unit:.3g}")
-    return _posterior_of(problem, space, members, sets, samples, about, others)
+    return _posterior_of(problem, space, members, sets, samples=samples, about=about, others=others)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +132,7 @@ def _looking(
     space: Space,
     groups: Sequence[Group],
     climbed: Callable[[Sets], State],
+    *,
     noise: Noise | None = None,
 ) -> Look:
     """What linearizes a problem and finds a set; with the noise that is there unless one is given."""
@@ -168,6 +169,7 @@ def _found(
     space: Space,
     fixed: Sequence[Candidate],
     groups: Sequence[Group],
+    *,
     start: Array,
     bends: Sequence[int],
 ) -> tuple[Array, Sets, State, dict[int, tuple[int, ...]]]:
@@ -179,22 +181,24 @@ def _found(
     if first.state.unit > BENT or not problem.noise_known:
         # Several large causes, none of which explains much alone, or far from linear: all of them at once first, as
         # large as they may be; or with the least values, where a straight line holds, if they leave nothing but noise.
-        begun = [look(all_at_once(problem, space, fixed, start, first.sets.noise, TAU[-1]))]
+        begun = [look(all_at_once(problem, space, fixed, start, noise=first.sets.noise, tau=TAU[-1]))]
         if problem.noise_known:
-            least = look(all_at_once(problem, space, fixed, start, first.sets.noise, EXACT))
+            least = look(all_at_once(problem, space, fixed, start, noise=first.sets.noise, tau=EXACT))
             begun += [least] if least is not None and least.state.unit <= BENT else []
         first = max((one for one in begun if one is not None), key=lambda one: one.score, default=first)
         problem.relinearize(space, first.about)
         rounds -= 1
-    last = _without_alternatives(problem, space, _settled(problem, space, first, look, rounds), look, rounds)
+    last = _without_alternatives(
+        problem, space, _settled(problem, space, first, look, rounds=rounds), look, rounds=rounds
+    )
     down = problem.noise_known and last.state.unit <= BENT
     # Structure is described by whatever comes nearest to it: what is found beside it is not compared so closely.
-    last, others = _of_bends(problem, space, last, bends if down else (), look)
+    last, others = _of_bends(problem, space, last, bends if down else (), look=look)
     return last.about, last.sets, last.state, others
 
 
 def _of_bends(
-    problem: Problem, space: Space, found: _Round, bends: Sequence[int], look: Look
+    problem: Problem, space: Space, found: _Round, bends: Sequence[int], *, look: Look
 ) -> tuple[_Round, dict[int, tuple[int, ...]]]:
     """The likeliest, of this and of those with another of the `bends` (groups) in the place of one that is there.
 
@@ -219,7 +223,7 @@ def _of_bends(
     return best, {k: tuple(sorted({j for on in likely if k not in on for j in on - own})) for k in own}
 
 
-def _without_alternatives(problem: Problem, space: Space, found: _Round, look: Look, rounds: int) -> _Round:
+def _without_alternatives(problem: Problem, space: Space, found: _Round, look: Look, *, rounds: int) -> _Round:
     """The same from a start without what is one of many alternatives, where that is likelier.
 
     An axis that slips by degrees where hardly anything depends on it is a place of its own: about it no straight line
@@ -230,14 +234,14 @@ def _without_alternatives(problem: Problem, space: Space, found: _Round, look: L
         return found
     without = found.sets.settled(State(np.where(chosen, 0.0, found.state.tau), found.state.unit))
     first = look(minimum_of(problem, space, found.sets, without))
-    other = None if first is None else _settled(problem, space, first, look, rounds)
+    other = None if first is None else _settled(problem, space, first, look, rounds=rounds)
     if other is not None and other.score > found.score:
         return other
     problem.relinearize(space, found.about)
     return found
 
 
-def _settled(problem: Problem, space: Space, first: _Round, look: Look, rounds: int) -> _Round:
+def _settled(problem: Problem, space: Space, first: _Round, look: Look, *, rounds: int) -> _Round:
     """Linearized anew about what was found, at most so many times, until it stays.
 
     Values that the data hardly tell can move on and on beside each other, to where the problem is another one. So it
@@ -245,7 +249,7 @@ def _settled(problem: Problem, space: Space, first: _Round, look: Look, rounds: 
     """
     now, score = first, -np.inf
     for _ in range(rounds - 1):
-        x, settled = next_values(problem, space, now.sets, now.state, now.about)
+        x, settled = next_values(problem, space, now.sets, now.state, x=now.about)
         if settled:
             break
         new = look(x)
@@ -269,13 +273,15 @@ def _averaged(sets: Sets, state: State) -> Samples:
 def resampled(problem: Problem, found: Posterior, rounds: int) -> Posterior:
     """The same with other weights of the captures, from the likeliest set on; linearized anew at most so many times."""
     space, old = found.space, found.sets
-    look = _looking(problem, space, old.groups, lambda sets: climb(sets, found.samples.best), old.noise)
+    look = _looking(problem, space, old.groups, lambda sets: climb(sets, found.samples.best), noise=old.noise)
     first = look(found.values)
     if first is None:
         return found
-    last = _settled(problem, space, first, look, rounds)
+    last = _settled(problem, space, first, look, rounds=rounds)
     samples = _averaged(last.sets, last.state)
-    return _posterior_of(problem, space, found.members, last.sets, samples, last.about, found.others)
+    return _posterior_of(
+        problem, space, found.members, last.sets, samples=samples, about=last.about, others=found.others
+    )
 
 
 def _posterior_of(
@@ -283,6 +289,7 @@ def _posterior_of(
     space: Space,
     members: tuple[tuple[int, ...], ...],
     sets: Sets,
+    *,
     samples: Samples,
     about: Array,
     others: Mapping[int, tuple[int, ...]],
@@ -294,5 +301,5 @@ def _posterior_of(
     noise = noise_of(problem, there)
     if not noise.unit(_total(problem, there)) <= GROWTH * noise.unit(sets.form.at(values / typical)):
         # The least certain values lie along a bent valley, in which the straight line to their mean does not stay.
-        values = improved(problem, space, sets.groups, samples, [about], 2 * STEPS)
+        values = improved(problem, space, sets.groups, samples, starts=[about], steps=2 * STEPS)
     return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical), others)

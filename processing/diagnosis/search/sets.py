@@ -146,7 +146,7 @@ class Sets:
     """
 
     def __init__(
-        self, form: Quadratic, groups: Sequence[Group], noise: Noise, count: float | None = None, beside: int = 0
+        self, form: Quadratic, groups: Sequence[Group], noise: Noise, count: float | None = None, *, beside: int = 0
     ) -> None:
         self.form, self.groups, self.noise, self.beside = form, tuple(groups), noise, beside
         self.free = np.array([g.fixed_tau is None for g in groups], dtype=bool)
@@ -183,7 +183,7 @@ class Sets:
 
     def among(self, form: Quadratic, kept: NDArray[np.int64], groups: Sequence[Group], beside: int) -> Sets:
         """The same prior for the groups `kept` alone, with new positions, where `beside` of the others are there."""
-        return Sets(form, groups, self.noise, self.count, self.beside + beside)
+        return Sets(form, groups, self.noise, self.count, beside=self.beside + beside)
 
     def _log_prior(self, tau: Array) -> float:
         """Log probability of a set and its variances."""

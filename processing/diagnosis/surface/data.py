@@ -115,7 +115,7 @@ def read_surface(
     height, width = signal.shape[2:]
     rows, columns = capture.frame_shape
     camera = _grid(view.camera.resized(rows, columns), cell * data.binned, height, width)
-    picked = _pick(data, signal, view.model_copy(update={"camera": camera}), omega, cell)
+    picked = _pick(data, signal, view.model_copy(update={"camera": camera}), omega, cell=cell)
     where = np.argwhere(picked)
     if len(where) < FEWEST_OF_MANY:
         raise ProcessError(
@@ -141,7 +141,7 @@ def read_surface(
     tile, fold = _tiles(where)
     return SurfaceData(
         name=data.name,
-        view=SurfaceView(view, camera, picked, omega, material, data.wavelength_nm),
+        view=SurfaceView(view, camera, picked, omega, material=material, wavelength_nm=data.wavelength_nm),
         y=y,
         variance=slope * np.maximum(y, 0) + floor,
         slope=slope,
@@ -176,7 +176,7 @@ def _black_variance(capture: Capture) -> float:
 
 
 def _pick(
-    data: CaptureData, signal: NDArray[np.float32], view: ViewingGeometry, omega: float, cell: int
+    data: CaptureData, signal: NDArray[np.float32], view: ViewingGeometry, omega: float, *, cell: int
 ) -> NDArray[np.bool_]:
     mask = view.at(omega).mask
     if not mask.any():

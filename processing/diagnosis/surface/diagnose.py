@@ -116,6 +116,7 @@ def recommended(
     space: Space,
     fit: Fit,
     rivals: Sequence[Candidate],
+    *,
     verdict: str,
     before: Sequence[dict[str, float]],
 ) -> str:
@@ -210,7 +211,7 @@ def diagnose_surface(problem: SurfaceProblem, material: str, say: Say) -> Surfac
     )
     kept = judgement.kept(solved, bool(named))
     found = _Found(likeliest, here, named, solved, kept, before, after)
-    return _told(problem, material, search, judgement, found)
+    return _told(problem, material, search, judgement, found=found)
 
 
 @dataclass(frozen=True)
@@ -234,6 +235,7 @@ def _told(
     material: str,
     search: OwnMinima,
     judgement: Judgement,
+    *,
     found: _Found,
 ) -> SurfaceJudged:
     kept, named, verdict, captures = found.kept, found.named, judgement.verdict, range(len(problem.captures))
@@ -254,7 +256,7 @@ def _told(
         unobservable=_unobservable(search, found.here),
         recommendation=wanted_for_evidence(problem)
         if verdict == "undetermined"
-        else recommended(problem, kept.space, kept.fit, rivals, verdict, found.before)
+        else recommended(problem, kept.space, kept.fit, rivals, verdict=verdict, before=found.before)
         + (CONFIRM if named and in_doubt else ""),
         unexplained=_unexplained(problem, found.likeliest, found.after, ranking)
         if verdict in ("unexplained", "partly_explained")
@@ -424,6 +426,7 @@ def diagnose_object(
     model: InstrumentModel,
     material: Any,
     view: ViewingGeometry,
+    *,
     say: Say = lambda line: None,
 ) -> tuple[SurfaceJudged, SurfaceProblem]:
     """Diagnose captures of one object jointly.

@@ -39,7 +39,7 @@ def quantities(problem: SurfaceProblem, k: int, space: Space, values: Array) -> 
     good = xi0[np.isfinite(xi0)]
     ideal = data.y - here.residual * problem.sigma[k]
     drawn = np.random.default_rng(0).normal(ideal, problem.sigma[k])
-    measured, expected = (dominant_errors(problem, k, space, values, y) for y in (data.y, drawn))
+    measured, expected = (dominant_errors(problem, k, space, values, y=y) for y in (data.y, drawn))
     said = Quantities(
         psi_deg=None if measured is None else rmsd(measured[0]),
         magnitude_percent=None if measured is None else rmsd(measured[1]),
@@ -66,7 +66,7 @@ def _xi0(here: Pixels) -> Array:
 
 
 def dominant_errors(
-    problem: SurfaceProblem, k: int, space: Space, values: Array, y: Array
+    problem: SurfaceProblem, k: int, space: Space, values: Array, *, y: Array
 ) -> tuple[Array, Array] | None:
     """Modelled less measured psi (degrees) and |D| (percent) of each pixel (P,); None if W has not rank 16."""
     optics, surface = problem.changes(k, space, values)

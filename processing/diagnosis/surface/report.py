@@ -145,7 +145,7 @@ def dominant_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> A
     axes = figure.subplots(1, 4)
     names = (("psi / degree", 90.0), ("|D| / %", 50.0))
     for column, (space, values) in enumerate(_models(judged)):
-        errors = dominant_errors(problem, k, space, values, data.y) or ()
+        errors = dominant_errors(problem, k, space, values, y=data.y) or ()
         for row, ((name, wide), error) in enumerate(zip(names, errors, strict=False)):
             axis = axes[2 * row + column]
             drawn = axis.imshow(_image(data.where, data.shape, error), vmin=-wide, vmax=wide, cmap=SIGNED)

@@ -32,7 +32,7 @@ def standard_errors(problem: SurfaceProblem, space: Space, fit: Fit, spread: flo
     wide = np.ones(space.size)
     for j in np.flatnonzero(bent(space)):
         step = SHOWN * error[j]
-        wide[j] = _wide(problem, space, fit, int(j), step, step**2 / max(bread[j, j], 1e-300))
+        wide[j] = _wide(problem, space, fit, int(j), step=step, promised=step**2 / max(bread[j, j], 1e-300))
     return np.asarray(error * wide * np.sqrt(spread))
 
 
@@ -54,7 +54,7 @@ def bent(space: Space) -> NDArray[np.bool_]:
     return np.array([isinstance(c.effect, BentValley) for c in space.candidates for _ in c.parameters], dtype=bool)
 
 
-def _wide(problem: SurfaceProblem, space: Space, fit: Fit, j: int, step: float, promised: float) -> float:
+def _wide(problem: SurfaceProblem, space: Space, fit: Fit, j: int, *, step: float, promised: float) -> float:
     """Factor on a step of value j that makes the excess rise as promised, on the flatter side."""
     lower, upper = space.joined("lower")[j], space.joined("upper")[j]
     others = np.arange(space.size) != j

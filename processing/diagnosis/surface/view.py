@@ -56,6 +56,7 @@ class SurfaceView:
         camera: PinholeCamera,
         pixels: NDArray[np.bool_],
         omega_deg: float,
+        *,
         material: ReflectanceModel,
         wavelength_nm: float,
     ) -> None:

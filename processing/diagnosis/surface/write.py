@@ -55,6 +55,7 @@ def write_surface(
     diagnosis: SurfaceDiagnosis,
     material: Any,
     view: ViewingGeometry,
+    *,
     instrument: InstrumentModel,
     note: str = "",
 ) -> list[Path]:

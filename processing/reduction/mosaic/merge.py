@@ -42,6 +42,7 @@ def merge(
     states: NDArray[np.int64],
     correction: Correction,
     noise: NoiseModel | None,
+    *,
     counts: CountsCorrection | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> MergedFrame:

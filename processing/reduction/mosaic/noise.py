@@ -84,6 +84,7 @@ def stokes_covariance(
     layout: MosaicLayout,
     method: str,
     solve: NDArray[np.float64],
+    *,
     frame: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
     """Covariance (6, rows, columns) of (S0, S1, S2): 00, 11, 22, 01, 02, 12.
@@ -97,7 +98,7 @@ def stokes_covariance(
     if frame is not None and chosen.covariance is not None:
         return chosen.covariance(variance, layout, solve, frame)
     if frame is not None and not chosen.linear:
-        return _local_covariance(variance, layout, method, solve, frame)
+        return _local_covariance(variance, layout, method, solve, frame=frame)
     out = np.empty((len(PAIRS), *variance.shape[1:]), np.float32)
     gain = noise_gain(layout, method, tuple(tuple(float(v) for v in row) for row in solve))
     step = 1 if _halves(method, layout) else 2
@@ -109,7 +110,7 @@ def stokes_covariance(
 
 
 def _local_covariance(
-    variance: NDArray[np.float32], layout: MosaicLayout, method: str, solve: NDArray[np.float64], frame: Image
+    variance: NDArray[np.float32], layout: MosaicLayout, method: str, solve: NDArray[np.float64], *, frame: Image
 ) -> NDArray[np.float32]:
     """Covariance of a method whose weights depend on the frame: it is linearized about the frame, pixel by pixel.
 

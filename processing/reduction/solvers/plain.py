@@ -82,7 +82,7 @@ class MuellerSolver:
         for a in range(start, stop, TILE):
             b = min(a + TILE, stop)
             part, result = tile[..., : b - a], product[:, : b - a]
-            gain = self.reader.load(frames, a, b, part, out["pixel_flags"])
+            gain = self.reader.load(frames, a, b, part, mask=out["pixel_flags"])
             np.matmul(self.stack, part.reshape(n, b - a), out=result)
             out["mueller"][:, a:b] = result[:16]
             rss = np.einsum("np,np->p", result[16:square], result[16:square])
@@ -147,7 +147,7 @@ def solve_with_the_sound(
             else:
                 unit = np.ones((frames.shape[1], len(part)), np.float32) if gain is None else gain
                 scale = np.asarray(np.broadcast_to(unit[None], raw.shape).reshape(n, -1).T, dtype=float)
-                errors, expected = _expected(solver, solve, keep, y, scale)
+                errors, expected = _expected(solver, solve, keep, y, scale=scale)
                 found["mueller_errors"][:, part] = errors
                 found["reduced_chi_square"][part] = np.where(free > 0, rss / expected, np.nan)
         found["mueller"][:, part] = m.T
@@ -160,6 +160,7 @@ def _expected(
     solve: NDArray[np.float64],
     keep: NDArray[np.float64],
     y: NDArray[np.float64],
+    *,
     scale: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Standard errors (16, pixels) and expected sum of squared residuals (pixels,) of fits to the states kept.

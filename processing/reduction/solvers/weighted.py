@@ -179,7 +179,7 @@ class WeightedSolver:
             signal = np.empty(raw.shape, np.float32)
             gain = self.reader.signal(raw, slice(a, b), signal)
             matrix = self._matrix.of(slice(a, b))
-            self._refit_saturated(matrix, raw, signal, found, slice(a, b))
+            self._refit_saturated(matrix, raw, signal, found, pixels=slice(a, b))
             fitted = matrix.times(found["mueller"][:, a:b])
             weight = self._weights(raw, slice(a, b), fitted, gain)
             residual = signal.reshape(n, b - a) - fitted
@@ -231,6 +231,7 @@ class WeightedSolver:
         raw: NDArray[Any],
         signal: NDArray[np.float32],
         found: dict[str, NDArray[Any]],
+        *,
         pixels: slice,
     ) -> None:
         """Put the plain fit without saturated intensities into `found`, for the pixels that have any."""

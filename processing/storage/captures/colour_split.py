@@ -48,7 +48,7 @@ def split_colours(path: Path, folder: Path) -> tuple[list[Path], bool]:
             raise ProcessError(f"{', '.join(there)} exists. Give another --out.")
         folder.mkdir(parents=True, exist_ok=True)
         for name, (rows, columns) in parts.items():
-            _write(capture, name, out[name], rows, columns, content)
+            _write(capture, name, out[name], rows, columns=columns, content=content)
     return list(out.values()), False
 
 
@@ -88,7 +88,9 @@ def _start(lines: Sequence[str], cell: int) -> int:
     return next((k for k in range(1, cell) if lines[k] != lines[k - 1]), 0)
 
 
-def _write(capture: Capture, name: str, out: Path, rows: np.ndarray, columns: np.ndarray, content: str | None) -> None:
+def _write(
+    capture: Capture, name: str, out: Path, rows: np.ndarray, *, columns: np.ndarray, content: str | None
+) -> None:
     header, done = capture.header, capture.done
     mosaic = header.mosaic
     if mosaic is not None:
@@ -110,7 +112,15 @@ def _write(capture: Capture, name: str, out: Path, rows: np.ndarray, columns: np
     targets = {axis: angles[done] for axis, angles in capture.planned_targets_deg().items()}
     role = tuple(capture.role)
     with h5py.File(out, "w") as h5:
-        create_layout(h5, part, targets, role, (len(rows), len(columns)), capture.dtype, capture.start_time)
+        create_layout(
+            h5,
+            part,
+            targets,
+            role,
+            frame_shape=(len(rows), len(columns)),
+            dtype=capture.dtype,
+            start_time=capture.start_time,
+        )
         for state in range(len(done)):
             h5["entry/instrument/detector/data"][state] = capture.frames(state)[:, rows][:, :, columns]
         for axis, angles in capture.angles_deg.items():

@@ -59,7 +59,14 @@ def _write(capture: Capture, old: h5py.File, new: Path) -> None:
     with h5py.File(new, "w") as h5:
         targets = capture.planned_targets_deg()
         create_layout(
-            h5, header, targets, roles, capture.frame_shape, capture.dtype, capture.start_time, frames=create_packed
+            h5,
+            header,
+            targets,
+            roles,
+            frame_shape=capture.frame_shape,
+            dtype=capture.dtype,
+            start_time=capture.start_time,
+            frames=create_packed,
         )
         entry = h5["entry"]
         frames = there["instrument/detector/data"]

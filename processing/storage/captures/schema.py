@@ -172,6 +172,7 @@ def create_layout(
     header: CaptureHeader,
     target_deg: dict[str, NDArray[np.float64]],
     role: tuple[str, ...],
+    *,
     frame_shape: tuple[int, int],
     dtype: Any,
     start_time: str,
@@ -217,7 +218,7 @@ def create_layout(
     attach(states["role"], entry, ["state"])
     for name, kind in STATE_COLUMNS.items():
         empty = np.nan if np.issubdtype(kind, np.floating) else EMPTY.get(name, 0)
-        column = _column(states, name, n, kind, empty)
+        column = _column(states, name, n, kind, fill=empty)
         column.attrs["units"] = COLUMN_UNITS.get(name, "")
         attach(column, entry, ["state"])
 
@@ -266,8 +267,8 @@ def _positioner(entry: h5py.Group, axis: str, target_deg: NDArray[np.float64]) -
     """An axis: where it was to be and where it was, in each state."""
     positioner = add_group(entry["instrument"], axis, "NXpositioner")
     positioner["name"] = axis
-    _column(positioner, "value", len(target_deg), np.float64, np.nan)
-    _column(positioner, "raw_value", len(target_deg), np.float64, np.nan)
+    _column(positioner, "value", len(target_deg), np.float64, fill=np.nan)
+    _column(positioner, "raw_value", len(target_deg), np.float64, fill=np.nan)
     positioner.create_dataset("target_value", data=target_deg)
     for name, units in (("value", "degree"), ("raw_value", "count"), ("target_value", "degree")):
         positioner[name].attrs["units"] = units
@@ -357,14 +358,14 @@ def _quantity(parent: h5py.Group, name: str, value: float, units: str) -> None:
     parent[name].attrs["units"] = units
 
 
-def _column(parent: h5py.Group, name: str, n: int, dtype: Any, fill: Any) -> h5py.Dataset:
+def _column(parent: h5py.Group, name: str, n: int, dtype: Any, *, fill: Any) -> h5py.Dataset:
     column = _allocated(parent, name, (n,), dtype, chunks=None)
     column[...] = np.full(n, fill, dtype=dtype)
     return column
 
 
 def _allocated(
-    parent: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any, chunks: tuple[int, ...] | None
+    parent: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any, *, chunks: tuple[int, ...] | None
 ) -> h5py.Dataset:
     # Early allocation: a full disc fails here, never in the middle of a run.
     create = h5py.h5p.create(h5py.h5p.DATASET_CREATE)

@@ -19,7 +19,7 @@ from processing.storage.products.provenance import made_of
 
 
 def product_of_axostep(
-    source: Path, out: Path, wavelength_nm: float | None, omega_deg: float | None, overwrite: bool
+    source: Path, out: Path, wavelength_nm: float | None, omega_deg: float | None, *, overwrite: bool
 ) -> tuple[list[str], bool]:
     """Write a Mueller product with the image of a .cmmi or .bmmi file, unless `out` is exactly that product.
 
@@ -66,7 +66,9 @@ def product_of_axostep(
         "weighted": False,
         "warnings": ["the file holds no standard errors and no raw intensities"],
     }
-    with ProductWriter(out, "mueller", header, (rows, columns), MUELLER_PLANES, (step,), overwrite) as writer:
+    with ProductWriter(
+        out, "mueller", header, (rows, columns), planes=MUELLER_PLANES, steps=(step,), overwrite=overwrite
+    ) as writer:
         # One intensity an element, whose noise is not known: readers of products then give NaN as standard error.
         writer.array("measurement_matrix", np.eye(16), "", "identity: the file holds elements, not intensities")
         for name in ("noise_slope", "noise_floor"):

@@ -224,7 +224,7 @@ def import_capture(request: ImportRequest, progress: Progress | None = None) -> 
     require_room(partial, len(states) * prod(source.shape) * source.dtype.itemsize, ImportFailed)
     try:
         with h5py.File(partial, "w") as h5:
-            _write(h5, header, states, source, progress)
+            _write(h5, header, states, source, progress=progress)
         os.replace(partial, request.out)
     finally:
         partial.unlink(missing_ok=True)
@@ -232,10 +232,12 @@ def import_capture(request: ImportRequest, progress: Progress | None = None) -> 
 
 
 def _write(
-    h5: h5py.File, header: CaptureHeader, states: StatesFile, source: FrameSource, progress: Progress | None
+    h5: h5py.File, header: CaptureHeader, states: StatesFile, source: FrameSource, *, progress: Progress | None
 ) -> None:
     now = datetime.now(UTC).isoformat(timespec="seconds")
-    create_layout(h5, header, states.angles_deg, states.role, source.shape[1:], source.dtype, now)
+    create_layout(
+        h5, header, states.angles_deg, states.role, frame_shape=source.shape[1:], dtype=source.dtype, start_time=now
+    )
     data = h5["entry/instrument/detector/data"]
     row_sums = np.zeros(data.shape[:3], np.uint32)
     count = 0
@@ -264,7 +266,7 @@ def _write(
 
 
 def _source(
-    request: ImportRequest, states: StatesFile, places: tuple[Place, ...], names: tuple[str, ...], has_model: bool
+    request: ImportRequest, states: StatesFile, places: tuple[Place, ...], names: tuple[str, ...], *, has_model: bool
 ) -> FrameSource:
     if states.channels:
         return _fluxes(states, names if has_model else tuple(states.channels))

@@ -111,7 +111,7 @@ def read_states(
     ignored: dict[str, list[str]] = {}
     if mapping:
         of_file = {n: t for n, t in mapping.items() if n not in known}
-        header, rows, ignored = _mapped(path, header, rows, of_file, axes)
+        header, rows, ignored = _mapped(path, header, rows, of_file, axes=axes)
     if "state" not in header:
         header, rows = ["state", *header], [(line, [str(k), *row]) for k, (line, row) in enumerate(rows)]
     header, rows = _with_arrays(path, header, rows, known)
@@ -136,7 +136,9 @@ def read_states(
     role = _roles(path, lines, texts_of)
     cells = {n: texts_of[n] for n in names if n not in ("state", "role", "file")}
     decimal_commas = delimiter != "," and any("," in text for texts in cells.values() for text in texts)
-    numbers = {n: _numbers(path, lines, n, texts, role, decimal_commas) for n, texts in cells.items()}
+    numbers = {
+        n: _numbers(path, lines, n, texts, role=role, decimal_commas=decimal_commas) for n, texts in cells.items()
+    }
     numbers |= {MILLI[n]: numbers.pop(n) / 1000 for n in tuple(numbers) if n in MILLI}
     turned = [n for n in numbers if not _is_known(n, n, ())]
     if radians:
@@ -174,7 +176,7 @@ def _rows_without_table(known: Mapping[str, NDArray[np.float64]], count: int | N
 
 
 def _mapped(
-    path: Path, header: list[str], rows: list[Row], mapping: Mapping[str, str], axes: Sequence[str]
+    path: Path, header: list[str], rows: list[Row], mapping: Mapping[str, str], *, axes: Sequence[str]
 ) -> tuple[list[str], list[Row], dict[str, list[str]]]:
     """The columns that have a name here, by the mapping or already in the file; and the others."""
     in_order = mapping.get("state") == IN_ORDER and IN_ORDER not in header
@@ -354,7 +356,7 @@ def _roles(path: Path, lines: list[int], columns: dict[str, list[str]]) -> tuple
 
 
 def _numbers(
-    path: Path, lines: list[int], name: str, texts: list[str], role: tuple[str, ...], decimal_commas: bool
+    path: Path, lines: list[int], name: str, texts: list[str], *, role: tuple[str, ...], decimal_commas: bool
 ) -> NDArray[np.float64]:
     # A point among decimal commas could only part thousands: as a comma it is no number.
     points = str.maketrans(",.", ".,") if decimal_commas else {}

@@ -70,7 +70,7 @@ def read_rows(
     start, stop, step = rows.indices(source.shape[-2])
     if step == 1 and stop > start and is_packed(source):
         try:
-            return _unpacked(source, start, stop, first, kept)
+            return _unpacked(source, start, stop, first, kept=kept)
         except (OSError, ValueError, RuntimeError, DAMAGED):
             # A chunk that was never written, is not packed, or is damaged.
             pass
@@ -87,7 +87,7 @@ def is_packed(source: h5py.Dataset) -> bool:
 
 
 def _unpacked(
-    source: h5py.Dataset, start: int, stop: int, first: tuple[int, ...], kept: KeptChunks | None
+    source: h5py.Dataset, start: int, stop: int, first: tuple[int, ...], *, kept: KeptChunks | None
 ) -> NDArray[Any]:
     more, columns, height = source.shape[len(first) : -2], source.shape[-1], source.chunks[-2]
     out = np.empty((*more, stop - start, columns), dtype=source.dtype)

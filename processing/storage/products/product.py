@@ -111,6 +111,7 @@ class ProductWriter(OpenH5):
         kind: str,
         header: CaptureHeader,
         shape: tuple[int, int],
+        *,
         planes: Mapping[str, Plane],
         steps: Sequence[Step],
         overwrite: bool = False,

@@ -70,8 +70,8 @@ def power_up(nodes: NodeTree, sensor: tuple[int, int], texts: dict[str, str]) ->
     for name, key, full in zip(("Width", "Height"), ("columns", "rows"), sensor, strict=True):
         for whole in (f"Sensor{name}", f"{name}Max"):
             if whole in nodes:
-                _require_size(nodes, whole, nodes.value(whole), key, full)
-        _require_size(nodes, name, nodes.limit(name, "Max"), key, full)
+                _require_size(nodes, whole, nodes.value(whole), key, full=full)
+        _require_size(nodes, name, nodes.limit(name, "Max"), key, full=full)
         nodes.set_value(name, full)
     _set_light(nodes)
     _choose(nodes, "PixelFormat", _first_format(nodes))
@@ -151,7 +151,7 @@ def _entries(nodes: NodeTree, name: str) -> list[str]:
     return []
 
 
-def _require_size(nodes: NodeTree, name: str, says: Number | None, key: str, full: int) -> None:
+def _require_size(nodes: NodeTree, name: str, says: Number | None, key: str, *, full: int) -> None:
     if says != full:
         raise nodes.error(
             name,
