@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -13,7 +14,7 @@ from acquisition.campaign.identity import read_identity
 from acquisition.campaign.log import LOG, read_index
 from acquisition.capture.writer import PARTIAL
 from processing.doors import MOST_JSON_BYTES, read_text
-from viewer.library import SATURATED, Entry, Library
+from viewer.library import SATURATED, Entry, Library, NotHere
 
 #: States of a cell, with what each means; in the order of the legend.
 STATUS = {
@@ -135,9 +136,11 @@ def read_campaign(folder: Path, library: Library, running: str | None = None) ->
 
 
 def _entry(path: Path, library: Library) -> Entry | None:
-    for there in (path, path.with_name(path.name + PARTIAL)):
+    # A capture may get its final name between the look at the one and at the other.
+    for there in (path, path.with_name(path.name + PARTIAL), path):
         if library.holds(there):
-            return library.entry(library.name(there))
+            with contextlib.suppress(NotHere):
+                return library.entry(library.name(there))
     return None
 
 

@@ -138,6 +138,22 @@ def test_each_capture_of_a_campaign_has_its_sign(lab, client, drr_capture):
     assert client.get("/campaign", params={"folder": "."}).status_code == 404
 
 
+def test_a_capture_that_ends_while_the_page_is_made_is_shown(lab, drr_capture):
+    folder = campaign(lab, drr_capture)
+    whole = folder / "1.h5"
+    partial = whole.rename(f"{whole}.partial")
+
+    class Ending(Library):
+        def holds(self, path):
+            found = super().holds(path)
+            if path == partial and found:
+                partial.rename(whole)
+            return found
+
+    (shown,) = [cell for cell in read_campaign(folder, Ending(lab)).cells if cell.name == whole.name]
+    assert shown.status == "done"
+
+
 def test_the_time_left_is_what_captures_have_taken(lab, drr_capture):
     view = read_campaign(campaign(lab, drr_capture), Library(lab), running="3.h5")
     # One minute each for the two that are failed and missing, and the rest of the one that runs.
