@@ -19,6 +19,7 @@ from acquisition.commands.defaults import CONFIGS
 from acquisition.rig.config import RigConfig
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
+from processing.maps.white_reference import Certificate
 from processing.reflectance.base import kinds
 from simulators.bench.scene import AnyScene
 
@@ -30,6 +31,7 @@ MODELS: dict[str, Any] = {
     "instrument": InstrumentModel,
     "geometry": ViewingGeometry,
     "scene": AnyScene,
+    "certificate": Certificate,
     "material": reduce(or_, kinds().values()),
 }
 

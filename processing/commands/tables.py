@@ -24,6 +24,11 @@ def table_command(
     geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
     out: Annotated[Path, typer.Option(help="Table file (HDF5) to write.")],
     layout: Annotated[str, typer.Option(help="Bins: degree (1 degree each) or renderer.")] = "degree",
+    white: Annotated[
+        Path | None, typer.Option(help="Mueller product of a white plaque: values become a BRDF in 1/sr.")
+    ] = None,
+    white_geometry: Annotated[Path | None, typer.Option(help="Geometry file of the plaque.")] = None,
+    certificate: Annotated[Path | None, typer.Option(help="Its reflectance factor and u: .yaml or .csv.")] = None,
     append: Annotated[bool, typer.Option("--append", help="Add to the table if it exists.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a table of that name.")] = False,
 ) -> None:
@@ -37,7 +42,12 @@ def table_command(
 
     if layout not in ("degree", "renderer"):
         raise ProcessError(f"--layout {layout!r}: there are degree and renderer")
-    step = Tabulation(tuple(sources), geometry, out, "renderer" if layout == "renderer" else "degree")
+    scale = None
+    if white is not None and white_geometry is not None and certificate is not None:
+        scale = white, white_geometry, certificate
+    elif not white is white_geometry is certificate is None:
+        raise ProcessError("--white, --white-geometry and --certificate belong together. Give all three.")
+    step = Tabulation(tuple(sources), geometry, out, "renderer" if layout == "renderer" else "degree", scale)
     with progress_bar("table", "images") as tick:
         step.append(tick) if append else step.make(overwrite=overwrite, progress=tick)
     table = ScatteringTable.load(out)
@@ -46,6 +56,8 @@ def table_command(
     typer.echo(f"  {', '.join(table.quantities[:4])}{' ...' if len(table.quantities) > 4 else ''}")
     for part, values in table.uncertainties.items():
         typer.echo(f"  {part}, median over bins and quantities: {np.nanmedian(values):.3g}")
+    if table.units:
+        typer.echo(f"  BRDF in 1/sr; relative standard uncertainty of its scale {100 * table.scale_u:.2g} %")
     typer.echo(f"  bins filled: {table.bins.size} of {91 * 91 * 360}, samples: {int(table.count.sum())}")
     typer.echo(str(out))
 
@@ -101,7 +113,9 @@ def compare_command(
 def export_command(
     tables: Annotated[list[Path], typer.Argument(help="Mueller tables in the renderer layout, one a wavelength.")],
     out: Annotated[Path, typer.Option(help="Renderer file (.pbsdf) to write; about 1 GB.")],
-    white_m00: Annotated[float, typer.Option(help="M00 of a perfect white surface at normal incidence.")] = 1.0,
+    white_m00: Annotated[
+        float, typer.Option(help="M00 of a perfect white surface at normal incidence, of a table without --white.")
+    ] = 1.0,
     keep_gaps: Annotated[bool, typer.Option("--keep-gaps", help="Leave empty bins black.")] = False,
     uncertainty: Annotated[bool, typer.Option("--uncertainty", help="Add u of each element; another 1 GB.")] = False,
 ) -> None:

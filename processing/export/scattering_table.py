@@ -50,6 +50,7 @@ def table_to_csv(source: Path, out: Path, quantities: Sequence[str] = (), overwr
         "simulated": table.simulated,
         "layout": table.axes.layout,
         "frames": table.frames or "none: scalars",
+        "scale": "BRDF in 1/sr" if table.units else "none",
         "uncertain_in_the_instrument": "; ".join(table.inputs) or "nothing stated",
     }
     write_csv(path, facts, dict.fromkeys(AXES, "degree"), columns)

@@ -14,6 +14,7 @@ from processing.errors import ProcessError
 from processing.geometry.frames import GeometryImage, frame_turns
 from processing.geometry.viewing import ViewingGeometry
 from processing.maps.intervals import moves_of
+from processing.maps.white_reference import SCALE, WhiteReference
 from processing.reduction.mueller import Progress
 from processing.reduction.systematic import INPUTS, Systematic
 from processing.reflectance.pbsdf import MUELLER
@@ -61,16 +62,24 @@ def _xi0_values(table: ScatteringTable, image: GeometryImage, product: Product) 
     return values
 
 
-def _mueller_values(table: ScatteringTable, image: GeometryImage, product: Product, rows: slice) -> Array:
+def _mueller_values(
+    table: ScatteringTable, image: GeometryImage, product: Product, *, rows: slice, white: WhiteReference | None
+) -> Array:
     """Values (planes, N) of a table from some rows of a Mueller product, turned into the renderer's axes."""
     block = MuellerImage.of(product, rows).at(np.flatnonzero(image.mask))
     left, right = frame_turns(image.points, image.points.half)
+    factor = np.ones(len(left)) if white is None else white.factor(product, image)
     parts = [(left @ block.matrices[:, 0].astype(float) @ right)[None]]
     if table.has_noise:
         parts.append(_turned_variance(block, left, right)[None])
     if table.inputs and (systematic := Systematic.of_product(product)) is not None:
         moves = moves_of(systematic, block).reshape(-1, 4, 4, len(left))
         parts.append(left @ np.moveaxis(moves, -1, 1) @ right)
+    if white is not None:
+        parts.append(white.u * parts[0])
+    parts = [part * factor[:, None, None] for part in parts]
+    if table.has_noise:
+        parts[1] = parts[1] * factor[:, None, None]
     return np.moveaxis(np.concatenate(parts), 1, -1).reshape(table.planes, -1)
 
 
@@ -86,7 +95,7 @@ def _turned_variance(image: MuellerImage, left: Array, right: Array) -> Array:
     return found.reshape(-1, 4, 4)
 
 
-def _table_for(product: Product, layout: Layout) -> ScatteringTable:
+def _table_for(product: Product, layout: Layout, white: WhiteReference | None) -> ScatteringTable:
     """An empty table for the samples of a product."""
     product.require("mueller", "xi0")
     if product.header.omega_deg is None:
@@ -97,6 +106,8 @@ def _table_for(product: Product, layout: Layout) -> ScatteringTable:
         require_all_elements(product)
         names, frames, has_noise = MUELLER, "renderer", bool(np.isfinite(product.get("mueller_errors")).any())
     inputs = tuple(str(product.facts[INPUTS]).split("; ")) if INPUTS in product.facts else ()
+    if white is not None and product.kind != "mueller":
+        raise ProcessError(f"{product.path} holds xi0, which has no absolute scale. Leave --white away.")
     return ScatteringTable(
         names,
         product.header.wavelength_nm,
@@ -104,7 +115,8 @@ def _table_for(product: Product, layout: Layout) -> ScatteringTable:
         product.simulated,
         frames=frames,
         has_noise=has_noise,
-        inputs=inputs,
+        inputs=inputs if white is None else (*inputs, SCALE),
+        scale_u=np.nan if white is None else white.u,
     )
 
 
@@ -116,6 +128,8 @@ def _require_alike(source: Path, own: ScatteringTable, table: ScatteringTable) -
         )
     if table.quantities != own.quantities:
         raise ProcessError(f"{source} has {own.quantities[0]}, the table has {table.quantities[0]}. Make one of each.")
+    if repr(table.scale_u) != repr(own.scale_u):
+        raise ProcessError(f"{source}: the table has another absolute scale. Use the same --white for all images.")
     if (table.has_noise, table.inputs) != (own.has_noise, own.inputs):
         raise ProcessError(
             f"{source} was reduced with other uncertainties than the images in the table: of the instrument "
@@ -131,13 +145,15 @@ def tabulate(
     table: ScatteringTable | None = None,
     *,
     progress: Progress | None = None,
+    white: WhiteReference | None = None,
 ) -> ScatteringTable:
     """Add the images of products to a table; a new one is made if none is given.
 
     Mueller matrices are turned into the renderer's axes pixel by pixel, so that pixels of one bin are alike.
     xi0 products add their valid pixels; the variance of each has its covariances with the other pixels of the bin.
     Those of Mueller images are not averaged over neighbours. The mean of each direction of the instrument's
-    uncertainty is in the table: the root of their sum of squares is the systematic uncertainty of a bin's mean.
+    uncertainty is in the table: the root of their sum of squares is the systematic uncertainty of a bin's mean. With a
+    white reference the elements are a BRDF in 1/sr, and its scale is one more direction.
 
     Raises
     ------
@@ -147,7 +163,7 @@ def tabulate(
     view = ViewingGeometry.load(geometry_file)
     for done, source in enumerate(sources, 1):
         with Product(source) as product:
-            own = _table_for(product, layout)
+            own = _table_for(product, layout, white)
             table = own if table is None else table
             _require_alike(source, own, table)
             kind, omega_deg = product.kind, float(product.header.omega_deg or 0.0)
@@ -158,7 +174,7 @@ def tabulate(
                 if not image.mask.any():
                     continue
                 if kind == "mueller":
-                    values = _mueller_values(table, image, product, rows)
+                    values = _mueller_values(table, image, product, rows=rows, white=white)
                 else:
                     values = _xi0_values(table, image, product)
                 table.add(image.points.angles, values, product.simulated)

@@ -70,6 +70,12 @@ def field_of(
     return Field(matrix, lambda x, y: extra_retardance(changes, x, y))
 
 
+def exposure_fact(capture: Capture, states: NDArray[np.int64]) -> dict[str, float]:
+    """Exposure in seconds that the counts of a product refer to, the longest of the states; none if not known."""
+    exposure = capture.column("exposure_s")[states].astype(float)
+    return {"exposure_s": float(exposure.max())} if np.isfinite(exposure).all() else {}
+
+
 def relative_exposure(capture: Capture, states: NDArray[np.int64]) -> NDArray[np.float64]:
     """Exposure of each state over the longest one, (states,); 1 where the capture does not know exposures."""
     exposure = capture.column("exposure_s")[states].astype(float)

@@ -18,7 +18,7 @@ from processing.reduction.counts_to_signal import Correction
 from processing.reduction.effects_of_capture import references
 from processing.reduction.facts import mueller_facts
 from processing.reduction.left_out import Exclusions
-from processing.reduction.measurement_matrix import some_of
+from processing.reduction.measurement_matrix import exposure_fact, some_of
 from processing.reduction.mueller_reduction import Choice, MuellerReduction
 from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.base import Solver
@@ -96,7 +96,7 @@ def reduce_mueller(
             product.discard()
             raise CaptureError(f"{capture.path}: {error}{_without_numbers(capture, reduction.states)}") from error
         facts["warnings"] += reduction.warnings
-        facts |= _further_facts(reduction) | references(capture, model)
+        facts |= _further_facts(reduction) | references(capture, model) | exposure_fact(capture, reduction.states)
         facts |= reduction.systematic.store(product) if reduction.systematic is not None else {}
         if levels is not None:
             facts["source"] = levels.told

@@ -19,6 +19,7 @@ from processing.reduction.effects_of_capture import CountsCorrection, capture_ch
 from processing.reduction.facts import in_words
 from processing.reduction.instrument_of_capture import require_one_colour
 from processing.reduction.left_out import Exclusions
+from processing.reduction.measurement_matrix import exposure_fact
 from processing.reduction.mosaic.demosaic import demosaic
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mosaic.merge import MergedFrame, merge
@@ -155,7 +156,7 @@ def reduce_stokes(
     rows, columns = channels.shape[1:]
     facts = _facts(found, analyzers, noise, correction, method=method, states=len(states))
     facts["warnings"] += cut_off
-    facts |= references(capture, model)
+    facts |= references(capture, model) | exposure_fact(capture, states)
     with ProductWriter(
         out, "stokes", capture.header, (rows, columns), planes=planes, steps=steps, overwrite=overwrite
     ) as product:

@@ -43,7 +43,8 @@ def export(
     ----------
     tables : one for each wavelength, of m00..m33 in "renderer" frames and layout.
     white_m00 : M00 that a perfect white surface has at normal incidence in these units; BRDF = M/(white pi cos).
-        Without a radiometric calibration only the polarization is right, not the absolute reflectance.
+        Without a radiometric calibration only the polarization is right, not the absolute reflectance. A table in 1/sr
+        is not scaled; its relative uncertainty is the field `scale_u`, NaN without.
     empty : what goes into visible bins without samples: the nearest filled bin's value, or NaN (black).
     pad_wavelengths : repeat the outer wavelengths up to the 5 that the renderer reads.
     progress : called with wavelengths written and in all.
@@ -58,11 +59,7 @@ def export(
     """
     ordered = sorted(tables, key=lambda t: t.wavelength_nm)
     for table in ordered:
-        _check(table)
-        if uncertainty and not table.has_noise:
-            raise TableError(
-                f"the table at {table.wavelength_nm:g} nm does not know its noise. Leave --uncertainty away."
-            )
+        _check(table, white_m00, uncertainty)
     wavelengths = [round(t.wavelength_nm) for t in ordered]
     slots = list(range(len(ordered)))
     while pad_wavelengths and len(slots) < RENDERER_WAVELENGTHS:
@@ -80,6 +77,7 @@ def export(
             "theta_d": ((1, SHAPE[1]), np.float32),
             "phi_d": ((1, SHAPE[2]), np.float32),
             "wvls": ((len(slots),), np.uint16),
+            "scale_u": ((len(slots),), np.float32),
             "M": (shape, np.float32),
             **({"u": (shape, np.float32)} if uncertainty else {}),
         },
@@ -88,6 +86,7 @@ def export(
     fields["theta_d"][0] = np.deg2rad(axes.theta_d_deg)
     fields["phi_d"][0] = np.deg2rad(axes.phi_d_deg)
     fields["wvls"][...] = wavelengths
+    fields["scale_u"][...] = [ordered[source].scale_u for source in slots]
     missing, written = 0.0, 0
     for k, table in enumerate(ordered):
         blocks = {}
@@ -147,7 +146,7 @@ def load(path: Path | str, white_m00: float = 1.0, only_nm: float | None = None)
     return tables
 
 
-def _check(table: ScatteringTable) -> None:
+def _check(table: ScatteringTable, white_m00: float, uncertainty: bool) -> None:
     wanted = (MUELLER, "renderer", "renderer")
     if (table.quantities, table.axes.layout, table.frames) != wanted:
         raise TableError(
@@ -156,6 +155,10 @@ def _check(table: ScatteringTable) -> None:
         )
     if table.bins.size == 0:
         raise TableError(f"the table at {table.wavelength_nm:g} nm is empty: nothing to export")
+    if table.units and white_m00 != 1.0:
+        raise TableError("a table of a BRDF in 1/sr has its scale already. Leave --white-m00 away.")
+    if uncertainty and not table.has_noise:
+        raise TableError(f"the table at {table.wavelength_nm:g} nm does not know its noise. Leave --uncertainty away.")
 
 
 def _grid() -> tuple[Angles, Array, Array]:
@@ -185,7 +188,8 @@ def _dense(table: ScatteringTable, values: Array, white_m00: float, empty: str) 
         index = distance_transform_edt(around < 0, return_distances=False, return_indices=True)
         row = around[tuple(index)][..., 180 : 180 + 361]
     scale = np.zeros(SHAPE, dtype=np.float32)
-    np.divide(1.0, white_m00 * np.pi * cos_i, out=scale, where=visible, casting="unsafe")
+    per = np.ones(SHAPE) if table.units else white_m00 * np.pi * cos_i
+    np.divide(1.0, per, out=scale, where=visible, casting="unsafe")
     scale[~visible | (row < 0)] = np.nan
     mean = values.astype(np.float32)
     out = np.empty((*SHAPE[::-1], 16), dtype=np.float32)

@@ -53,6 +53,7 @@ class ScatteringTable:
     frames : axes to which Mueller elements refer: "instrument", "renderer" or "" for scalars.
     has_noise : whether samples come with the variance of their noise.
     inputs : uncertain inputs of the instrument; samples come with what one standard uncertainty of each does to them.
+    scale_u : standard uncertainty of the absolute scale over itself; NaN: values are in counts, not a BRDF in 1/sr.
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class ScatteringTable:
         frames: str = "",
         has_noise: bool = False,
         inputs: tuple[str, ...] = (),
+        scale_u: float = np.nan,
     ) -> None:
         self.quantities = quantities
         self.wavelength_nm = float(wavelength_nm)
@@ -73,6 +75,7 @@ class ScatteringTable:
         self.frames = frames
         self.has_noise = has_noise
         self.inputs = inputs
+        self.scale_u = float(scale_u)
         self._row = np.full(SHAPE[0] * SHAPE[1] * SHAPE[2], -1, dtype=np.int32)
         self.bins = np.empty(0, dtype=np.int32)
         self.count = np.empty(0, dtype=np.int64)
@@ -119,6 +122,11 @@ class ScatteringTable:
         good = rows >= 0
         for plane, more in zip(v[quantities:], total[quantities:], strict=True):
             more += np.bincount(rows[good], plane[good], minlength=count.size)
+
+    @property
+    def units(self) -> str:
+        """Of the values: 1/sr of a BRDF, or empty."""
+        return "1/sr" if np.isfinite(self.scale_u) else ""
 
     @property
     def planes(self) -> int:
@@ -174,7 +182,8 @@ class ScatteringTable:
     def merge(self, other: ScatteringTable) -> None:
         """Add all samples of another table of the same quantities, wavelength and layout. Raises TableError."""
         mine, theirs = (
-            (t.quantities, t.wavelength_nm, t.axes, t.simulated, t.frames, t.has_noise, t.inputs) for t in (self, other)
+            (t.quantities, t.wavelength_nm, t.axes, t.simulated, t.frames, t.has_noise, t.inputs, repr(t.scale_u))
+            for t in (self, other)
         )
         if mine != theirs:
             raise TableError(f"tables differ and cannot be merged: {mine} and {theirs}")
@@ -207,6 +216,7 @@ class ScatteringTable:
             h5.attrs["wavelength_nm"] = self.wavelength_nm
             h5.attrs["layout"] = self.axes.layout
             h5.attrs["simulated"] = self.simulated
+            h5.attrs["scale_u"] = self.scale_u
             h5.attrs["frames"] = self.frames
             h5.attrs.update({"quantities": list(self.quantities), "inputs": list(self.inputs), "default": "entry"})
             entry = add_group(h5, "entry", "NXentry")
@@ -259,7 +269,7 @@ class ScatteringTable:
             self.mean,
             data,
             dimensions=("quantity", "bin"),
-            units="",
+            units=self.units,
             long_name="mean of the samples in the bin",
         )
         _put(
@@ -274,7 +284,7 @@ class ScatteringTable:
         for name, text in UNCERTAINTIES.items():
             if name in self.uncertainties:
                 values = self.uncertainties[name]
-                _put(data, name, values, data, dimensions=("quantity", "bin"), units="", long_name=text)
+                _put(data, name, values, data, dimensions=("quantity", "bin"), units=self.units, long_name=text)
         if self.inputs:
             add_scales(data, {"input": len(self.inputs)})
             data["input_name"] = [name.encode() for name in self.inputs]
@@ -314,6 +324,7 @@ class ScatteringTable:
                 frames=str(a["frames"]),
                 has_noise=has_noise,
                 inputs=tuple(inputs),
+                scale_u=float(a.get("scale_u", np.nan)),
             )
             if not np.allclose(sums["theta_h_deg"][...], table.axes.theta_h_deg):
                 raise TableError(f"{path}: its theta_h axis is not that of layout {a['layout']!r}")

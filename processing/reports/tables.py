@@ -25,6 +25,7 @@ def table_section(path: Path) -> Section:
         ("layout", table.axes.layout),
         ("bins filled", f"{table.bins.size} of {SHAPE[0] * SHAPE[1] * (SHAPE[2] - 1)}"),
         ("samples", str(int(table.count.sum()))),
+        *([("scale", f"BRDF in 1/sr, relative standard uncertainty {table.scale_u:.2g}")] if table.units else []),
         ("uncertain in the instrument", "; ".join(table.inputs) or "nothing stated"),
         *(
             (f"{part} of a bin's mean {name}, median", f"{np.nanmedian(values[0]):.3g}")

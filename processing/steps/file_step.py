@@ -30,7 +30,7 @@ class OfFiles:
     def __post_init__(self) -> None:
         for entry in fields(self):  # type: ignore[arg-type]  # its subclasses are dataclasses
             value = getattr(self, entry.name)
-            if "tuple[Path" in str(entry.type):
+            if "tuple[Path" in str(entry.type) and value is not None:
                 value = tuple(map(Path, [value] if isinstance(value, str | Path) else value))
             elif "Path" in str(entry.type) and value is not None:
                 value = Path(value)

@@ -9,6 +9,7 @@ from pathlib import Path
 from processing.doors import require_distinct
 from processing.errors import ProcessError
 from processing.maps.tables import tabulate
+from processing.maps.white_reference import WhiteReference
 from processing.reflectance.table_axes import Layout
 from processing.reflectance.tables import ScatteringTable, table_steps
 from processing.steps.file_step import FileStep, Progress
@@ -30,6 +31,8 @@ class Tabulation(FileStep):
         The table; it has no other usual name.
     layout
         Of the bins.
+    white
+        Mueller product of a white plaque, its geometry file and its certificate; None: values in counts.
 
     Examples
     --------
@@ -42,6 +45,7 @@ class Tabulation(FileStep):
     geometry: Path
     out: Path
     layout: Layout = "degree"
+    white: tuple[Path, Path, Path] | None = None
 
     @property
     def usual_path(self) -> Path:
@@ -52,10 +56,19 @@ class Tabulation(FileStep):
         """Layout, sources and geometry."""
         require_distinct(self.sources)
         inputs = [file_identity(source, "source") for source in self.sources]
+        if self.white is not None:
+            plaque, geometry, certificate = self.white
+            inputs += [file_identity(plaque, "white"), *geometry_identities(geometry)]
+            inputs.append(file_identity(certificate, "certificate"))
         return Step("table", {"layout": self.layout}, (*inputs, *geometry_identities(self.geometry)))
 
+    @property
+    def _scale(self) -> WhiteReference | None:
+        return None if self.white is None else WhiteReference.of(*self.white)
+
     def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
-        tabulate(self.sources, self.geometry, self.layout, progress=progress).save(out, (record,))
+        made = tabulate(self.sources, self.geometry, self.layout, progress=progress, white=self._scale)
+        made.save(out, (record,))
 
     def append(self, progress: Progress | None = None) -> Path:
         """Add the sources to the table that is there; without one, make it.
@@ -71,7 +84,8 @@ class Tabulation(FileStep):
         _refuse_twice(record, before)
         grown = Step("table", record.arguments, (*record.inputs, file_identity(self.out, "table")))
         table = ScatteringTable.load(self.out)
-        tabulate(self.sources, self.geometry, self.layout, table, progress=progress).save(self.out, (*before, grown))
+        tabulate(self.sources, self.geometry, self.layout, table, progress=progress, white=self._scale)
+        table.save(self.out, (*before, grown))
         return self.out
 
 
