@@ -11,8 +11,10 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 
 from processing.errors import ProcessError
+from processing.maps.intervals import moves_of
 from processing.polarization.propagation import Derived
 from processing.reduction.noise import NoiseModel
+from processing.reduction.systematic import INPUTS, Systematic
 from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
 from processing.storage.captures.capture import Capture
 from processing.storage.products.images import MuellerImage, difference_errors, element_gradient
@@ -86,7 +88,7 @@ def _same_shape(a: tuple[int, int], b: tuple[int, int]) -> None:
 
 
 def difference(request: Request) -> Response:
-    """Four pictures of one window: a, b, a - b, and that over its standard error."""
+    """Four pictures of one window: a, b, a - b, and that over its standard error, of noise and instrument together."""
     a, b, query = file_of(request, "a"), file_of(request, "b"), request.query_params
     if is_product(a):
         with Product(a) as first, Product(b) as second:
@@ -94,11 +96,12 @@ def difference(request: Request) -> Response:
             window = Window.asked(query, first.shape, most=640)
             one, other = (product_values(product, query, window) for product in (first, second))
             shared = _shared_errors(first, second, query, window)
+            systematic = _systematic_errors(first, second, query, window)
             name, index = asked_of(first, query)
             units = "" if name == "mueller" or name in DERIVED else first.units(name)
             scale = scale_of("m00" if name == "mueller" and index == 0 else name, units, one[0])
     else:
-        shared = None
+        shared, systematic = None, np.zeros(())
         with Capture(a) as early, Capture(b) as late:
             _same_shape(early.frame_shape, late.frame_shape)
             window = Window.asked(query, early.frame_shape, most=640)
@@ -107,19 +110,26 @@ def difference(request: Request) -> Response:
     apart = one[0] - other[0]
     if (period := None if name is None else period_deg(name, units)) is not None:
         apart = (apart + period / 2) % period - period / 2
+    noise = np.hypot(one[1], other[1]) if shared is None else shared
     with np.errstate(divide="ignore", invalid="ignore"):
-        over = apart / (np.hypot(one[1], other[1]) if shared is None else shared)
+        over = apart / np.hypot(noise, systematic)
     wide = scale_of("deviation", "", apart)
     scales = [scale, scale, wide, Scale(SIGNED, -ERRORS_SHOWN, ERRORS_SHOWN)]
-    known = over[np.isfinite(over)]
     return sent(
         window,
         np.stack([one[0], other[0], apart, over]).astype(np.float32),
         scales=[{"colours": s.colours, "low": s.low, "high": s.high} for s in scales],
         units=units_words(units),
-        rms=float(np.sqrt(np.nanmean(apart**2))) if np.isfinite(apart).any() else None,
-        rms_over=float(np.sqrt(np.mean(known**2))) if known.size else None,
+        rms=_rms(apart),
+        rms_noise=_rms(noise),
+        rms_systematic=_rms(np.asarray(systematic)),
+        rms_over=_rms(over),
     )
+
+
+def _rms(values: NDArray[np.floating]) -> float | None:
+    known = values[np.isfinite(values)].astype(float)
+    return float(np.sqrt(np.mean(known**2))) if known.size else None
 
 
 def _ends(counts: NDArray[np.float32]) -> tuple[float, float]:
@@ -165,6 +175,38 @@ def _shared_errors(first: Product, second: Product, query: Any, window: Window) 
     images = [_image(product, window) for product in (first, second)]
     slopes = [element_gradient(i, index) if name == "mueller" else _derived(i, name).gradient for i in images]
     return difference_errors(images, slopes).reshape(window.shape)
+
+
+def _systematic_errors(first: Product, second: Product, query: Any, window: Window) -> NDArray[np.floating]:
+    """What the instruments' uncertainties make of a difference, (rows, columns).
+
+    Products with the same uncertain inputs are of one instrument: its error leaves the difference as far as it moves
+    both alike. Where only the size of both errors is known, they add.
+    """
+    (one, a), (other, b) = (_moved(product, query, window) for product in (first, second))
+    if first.facts.get(INPUTS) != second.facts.get(INPUTS):
+        return np.asarray(np.hypot(a, b))
+    return np.asarray(a + b if one is None or other is None else np.sqrt(np.square(one - other).sum(axis=0)))
+
+
+def _moved(product: Product, query: Any, window: Window) -> tuple[NDArray[np.floating] | None, NDArray[np.floating]]:
+    """What each uncertain input of the instrument does to a map (D, rows, columns), if known, and their size."""
+    name, index = asked_of(product, query)
+    moved = None
+    if product.kind == "mueller" and (name == "mueller" or _is_derived(product, query)):
+        systematic = Systematic.of_product(product)
+        if systematic is not None:
+            image = _image(product, window)
+            slope = element_gradient(image, index) if name == "mueller" else _derived(image, name).gradient
+            moved = np.einsum("dixy,xyi->dxy", moves_of(systematic, image), slope).reshape(-1, *window.shape)
+    elif f"{name}_directions" in product.names:
+        moved = window.every(product.get(f"{name}_directions", window.rows))
+    if moved is not None:
+        return moved, np.sqrt(np.square(moved).sum(axis=0))
+    if f"{name}_systematic" not in product.names:
+        return None, np.zeros(window.shape)
+    size = read_map(product, f"{name}_systematic", index, window)
+    return None, size / read_map(product, name, 0, window) if name == "mueller" else size
 
 
 def _image(product: Product, window: Window) -> MuellerImage:

@@ -137,6 +137,31 @@ def test_products_of_one_capture_share_its_noise(client, lab, drr_capture, confi
     assert np.nanstd(over) == pytest.approx(1, abs=0.25)
 
 
+def test_a_difference_has_what_the_instruments_do_not_do_alike(client, lab, drr_capture, configs, tmp_path):
+    """One instrument moves M of one sample alike in two captures, not that of another sample; two instruments add."""
+    text = (configs / "instruments/rgb950.yaml").read_text()
+    files = []
+    for value in ("127.12", "94.78"):
+        files.append(tmp_path / f"{value}.yaml")
+        files[-1].write_text(text.replace(f"662: {value}", f"662: {{value: {value}, u: 0.5}}"))
+    one, two = drr_capture("one.h5"), drr_capture("two.h5", seed_of_noise=2)
+    three = drr_capture("three.h5", seed_of_noise=3, mueller=np.diag([1.0, 0.6, 0.1, 0.3]))
+    for k, (capture, file) in enumerate(((one, 0), (two, 0), (three, 0), (two, 1))):
+        Reduction(capture, files[file]).make(out=lab / f"{k}.mueller.h5")
+    found = {}
+    for k in (1, 2, 3):
+        asked = {"a": "0.mueller.h5", "b": f"{k}.mueller.h5", "name": "mueller", "index": 10}
+        (_, _, apart, over), found[k] = plane(client.get("/difference", params=asked))
+        expected = np.hypot(found[k]["rms_noise"], found[k]["rms_systematic"])
+        assert np.nanstd(apart) / np.nanstd(over) == pytest.approx(expected, rel=0.1)
+    with Product(lab / "0.mueller.h5") as product:
+        alone = np.median(product.get("mueller_systematic")[2, 2] / product.get("mueller")[0, 0])
+    # What is left is the noise of the matrices that are moved.
+    assert found[1]["rms_systematic"] < 0.2 * alone
+    assert found[2]["rms_systematic"] > 0.3 * alone
+    assert found[3]["rms_systematic"] >= 0.99 * alone
+
+
 @pytest.mark.parametrize("asked", [{"index": 16}, {"index": "x"}, {"name": "nothing"}, {"name": ""}])
 def test_a_map_that_is_not_there_is_not_compared(client, products, asked):
     both = {"a": "one.mueller.h5", "b": "one.mueller.h5", "name": "mueller"}

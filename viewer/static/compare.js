@@ -27,7 +27,7 @@ async function refresh(leader = views[0]) {
   try {
     const plane = await read(leader.window(), reading.signal);
     const told = v => (v === null ? "not known" : v.toPrecision(3));
-    byId("told").textContent = `rms difference ${told(plane.rms)}${plane.units && ` ${plane.units}`}; over its error ${told(plane.rms_over)} (1 is noise alone)`;
+    byId("told").textContent = `rms difference ${told(plane.rms)}${plane.units && ` ${plane.units}`}; its standard error by noise ${told(plane.rms_noise)}, by the instrument ${told(plane.rms_systematic)}; over its error ${told(plane.rms_over)} (1: errors alone)`;
     const ranges = leader.node.layout && [leader.node.layout.xaxis.range, leader.node.layout.yaxis.range];
     for (const [k, view] of views.entries()) {
       view.plane = plane;
