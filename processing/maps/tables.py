@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations_with_replacement
 from pathlib import Path
 
@@ -67,32 +67,37 @@ def _mueller_values(
 ) -> Array:
     """Values (planes, N) of a table from some rows of a Mueller product, turned into the renderer's axes."""
     block = MuellerImage.of(product, rows).at(np.flatnonzero(image.mask))
-    left, right = frame_turns(image.points, image.points.half)
-    factor = np.ones(len(left)) if white is None else white.factor(product, image)
-    parts = [(left @ block.matrices[:, 0].astype(float) @ right)[None]]
+    left, right = (np.ascontiguousarray(np.moveaxis(m, 0, -1)) for m in frame_turns(image.points, image.points.half))
+    # What each element (second) adds to each turned one (first), (N,).
+    share = {(k, i): left[k // 4, i // 4] * right[i % 4, k % 4] for g in _MIXED for k in g for i in g}
+    factor = np.ones(left.shape[-1]) if white is None else white.factor(product, image)
+    values = factor * _turned(block.values.reshape(1, 16, -1), share)
+    parts = [values]
     if table.has_noise:
-        parts.append(_turned_variance(block, left, right)[None])
+        parts.append(np.square(factor) * _turned_variance(block, share)[None])
     if table.inputs and (systematic := Systematic.of_product(product)) is not None:
-        moves = moves_of(systematic, block).reshape(-1, 4, 4, len(left))
-        parts.append(left @ np.moveaxis(moves, -1, 1) @ right)
+        parts.append(factor * _turned(moves_of(systematic, block)[..., 0], share))
     if white is not None:
-        parts.append(white.u * parts[0])
-    parts = [part * factor[:, None, None] for part in parts]
-    if table.has_noise:
-        parts[1] = parts[1] * factor[:, None, None]
-    return np.moveaxis(np.concatenate(parts), 1, -1).reshape(table.planes, -1)
+        parts.append(white.u * values)
+    return np.concatenate(parts).reshape(table.planes, -1)
 
 
-def _turned_variance(image: MuellerImage, left: Array, right: Array) -> Array:
-    """Variance (N, 4, 4) of the elements of left @ M @ right, where the outer two (N, 4, 4) are rotations."""
-    found = np.zeros((len(left), 16))
-    for group in _MIXED:
-        share = {(k, i): left[:, k // 4, i // 4] * right[:, i % 4, k % 4] for k in group for i in group}
-        for i, j in combinations_with_replacement(group, 2):
-            between = (1 + (i != j)) * image.covariance_between(i, j)[:, 0]
-            for k in group:
-                found[:, k] += share[k, i] * share[k, j] * between
-    return found.reshape(-1, 4, 4)
+def _turned(values: NDArray[np.floating], share: Mapping[tuple[int, int], Array]) -> Array:
+    """Elements (D, 16, N) in turned axes."""
+    found = np.zeros(values.shape)
+    for (k, i), part in share.items():
+        found[:, k] += part * values[:, i]
+    return found
+
+
+def _turned_variance(image: MuellerImage, share: Mapping[tuple[int, int], Array]) -> Array:
+    """Variance (16, N) of the elements in turned axes."""
+    pairs = [pair for group in _MIXED for pair in combinations_with_replacement(group, 2)]
+    found = np.zeros((16, image.mask.size))
+    for (i, j), between in zip(pairs, image.covariances_between(pairs), strict=True):
+        for k in next(group for group in _MIXED if i in group):
+            found[k] += (1 + (i != j)) * share[k, i] * share[k, j] * between
+    return found
 
 
 def _table_for(product: Product, layout: Layout, white: WhiteReference | None) -> ScatteringTable:

@@ -223,12 +223,13 @@ class MuellerImage:
             found = np.diag(gram) @ variance * told, square * told**2
         return found[0].reshape(self.mask.shape).astype(float), found[1].reshape(self.mask.shape).astype(float)
 
-    def covariance_between(self, first: int, second: int) -> NDArray[np.float64]:
-        """Covariance (rows, columns) of two elements, given by their numbers in row-major order; counts^2."""
+    def covariances_between(self, pairs: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+        """Covariances (pairs, pixels) of elements, given by their numbers in row-major order; counts^2."""
+        first, second = np.array(pairs).T
         if self.facts["weighted"]:
-            return np.asarray(self._covariance[..., first, second])
+            return np.asarray(self._covariance.reshape(-1, 16, 16)[:, first, second].T)
         drive, variance = self._sources
-        return np.asarray(((drive[first] * drive[second]) @ variance * self._told).reshape(self.mask.shape))
+        return np.asarray((drive[first] * drive[second]) @ variance * self._told)
 
     def product_of(self, form: NDArray[np.float64], gradient: NDArray[np.floating]) -> NDArray[np.float64]:
         """Sum over elements a, b, k of covariance[a, b] form[a, b, k] gradient[k]: (rows, columns).
