@@ -74,7 +74,7 @@ def cells(
     stack = np.stack(list(matrices.values()))
     truth = _planes(noisy_image(stack, BRIGHT, 0, w), extra)
     seed = [7, darks, int(electrons), list(seven_instruments()).index(instrument)]
-    found = _planes(noisy_image(np.repeat(stack, pixels, axis=0), electrons, seed, w, darks), extra)
+    found = _planes(noisy_image(np.repeat(stack, pixels, axis=0), electrons, seed, w, darks=darks), extra)
     for k, sample in enumerate(matrices):
         mine = slice(k * pixels, (k + 1) * pixels)
         for name in found:

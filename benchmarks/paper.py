@@ -52,10 +52,10 @@ def run(work: Path, out: Path, size: Size, pool: Executor, *, figure: Path | Non
         folders = [bench.submit(taken, number) for number in range(3)]
         sphere = study_sphere(folders[0].result(), work / "results/sphere", pool, say)
         body = study_body(folders[1].result())
-        fault = study_fault(folders[2].result(), work / "results/fault", sphere, pool, say)
+        fault = study_fault(folders[2].result(), work / "results/fault", sphere, pool, say=say)
     say("page")
     seconds["in all"] = time.perf_counter() - begin
-    write_page(out, size, sphere, body, fault, seconds)
+    write_page(out, size, sphere, body, fault=fault, seconds=seconds)
     if figure is not None:
         deviations(sphere).figure.savefig(figure, dpi=80)
     say(str(out))

@@ -103,13 +103,13 @@ def _turned_variance(image: MuellerImage, share: Mapping[tuple[int, int], Array]
 def _table_for(product: Product, layout: Layout, white: WhiteReference | None) -> ScatteringTable:
     """An empty table for the samples of a product."""
     product.require("mueller", "xi0")
-    if product.header.omega_deg is None:
-        raise ProcessError(f"{product.path}: the capture does not say its arm angle; it belongs to no bin.")
     names: tuple[str, ...] = ("xi0",)
     frames, has_noise = "", True
     if product.kind == "mueller":
         require_all_elements(product)
         names, frames, has_noise = MUELLER, "renderer", bool(np.isfinite(product.get("mueller_errors")).any())
+    if product.header.omega_deg is None:
+        raise ProcessError(f"{product.path}: the capture does not say its arm angle; it belongs to no bin.")
     inputs = tuple(str(product.facts[INPUTS]).split("; ")) if INPUTS in product.facts else ()
     if white is not None and product.kind != "mueller":
         raise ProcessError(f"{product.path} holds xi0, which has no absolute scale. Leave --white away.")

@@ -148,8 +148,8 @@ def test_a_file_that_is_not_meant_is_called_what_it_is(run, acquire, capture, co
     # Products and tables lie beside captures; none is a damaged capture.
     with h5py.File(tmp_path / "table.h5", "w") as h5:
         h5.attrs["umov_table"] = 1
-    found, _, left_out = find_captures(tmp_path)
-    assert ([path for path, *_ in found], left_out) == ([capture], [])
+    found, _, left_out, damaged = find_captures(tmp_path)
+    assert ([path for path, *_ in found], left_out, damaged) == ([capture], [], [])
     for command in ("verify", "repair"):
         code, out, err = acquire(command, tmp_path)
         assert (code, err) == (0, "")

@@ -114,9 +114,10 @@ def test_a_stopped_campaign_is_processed_without_what_is_not_complete(synthetic_
     (tmp_path / "index.json").write_text(
         json.dumps({"whole.h5": {"status": "complete"}, "gone.h5": {"status": "failed"}})
     )
-    found, simulated, left_out = find_captures(tmp_path)
+    found, simulated, left_out, damaged = find_captures(tmp_path)
     assert [path for path, *_ in found] == [whole]
     assert simulated
+    assert not damaged
     assert any("half.h5: 2 of 4 states" in line for line in left_out)
     assert any("cut.h5.partial: a capture that is not finished" in line for line in left_out)
     assert any("gone.h5: failed" in line for line in left_out)

@@ -20,7 +20,7 @@ def cells(text: str, row: str) -> list[str]:
 def test_the_page(tmp_path: Path) -> None:
     """One test, so that no second process takes the study anew."""
     with executor(1) as pool:
-        paper.run(tmp_path, tmp_path / "paper.html", QUICK, pool, tmp_path / "deviations.png")
+        paper.run(tmp_path, tmp_path / "paper.html", QUICK, pool, figure=tmp_path / "deviations.png")
     assert (tmp_path / "deviations.png").stat().st_size > 10_000
     text = (tmp_path / "paper.html").read_text(encoding="utf-8")
     every_figure_and_table_of_the_paper_has_its_place(text)

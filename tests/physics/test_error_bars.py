@@ -30,7 +30,9 @@ def test_every_interval_covers_for_every_sample(electrons: float, darks: int) ->
 
 @pytest.mark.parametrize("name", ["diattenuation", "polarizance_purity", "depolarization_index", "mueller"])
 def test_where_nothing_is_polarized_intervals_hold_as_often_as_they_claim(name: str) -> None:
-    found = cells("RGB950's 40", 0, 200, 1500, ["ideal depolarizer", "nearly ideal depolarizer", "air"], ())
+    found = cells(
+        "RGB950's 40", 0, 200, 1500, samples=["ideal depolarizer", "nearly ideal depolarizer", "air"], extra=()
+    )
     for cell in found:
         if cell.quantity == name:
             # The noise of the 15 elements is not quite alike in all directions, which the interval does not know.
@@ -40,7 +42,9 @@ def test_where_nothing_is_polarized_intervals_hold_as_often_as_they_claim(name: 
 
 def test_depolarization_power_of_a_depolarizer_has_no_bias() -> None:
     cell = next(
-        c for c in cells("RGB950's 40", 0, 200, 1500, ["ideal depolarizer"], ()) if c.quantity == "depolarization_power"
+        c
+        for c in cells("RGB950's 40", 0, 200, 1500, samples=["ideal depolarizer"], extra=())
+        if c.quantity == "depolarization_power"
     )
     # Its 95 % interval covered 28 %, and the mean pull was -2.35.
     assert cell.in_95 > 0.93
@@ -141,6 +145,8 @@ def test_noise_alone_is_taken_off_what_td_misses() -> None:
 
 @pytest.mark.parametrize("instrument", list(seven_instruments())[1:])
 def test_poor_states_have_intervals_that_cover_too(instrument: str) -> None:
-    found = list(cells(instrument, 0, 20_000, PIXELS, ["triply degenerate", "retarder 90", "mirror-like"], ()))
+    found = list(
+        cells(instrument, 0, 20_000, PIXELS, samples=["triply degenerate", "retarder 90", "mirror-like"], extra=())
+    )
     low = [c for c in found if c.quantity not in LOOSE and (c.in_68 < LEAST_68 or c.in_95 < LEAST_95)]
     assert len(low) <= 3, low
