@@ -215,9 +215,7 @@ class _Image:
         with Product(self._path) as product:
             name, index = asked_of(product, query)
             values, errors = product_values(product, query, window)
-            units = (
-                "" if name == "mueller" and index else "count" if name == "mueller" else product_units(product, name)
-            )
+            units = _units(product, name, index)
             systematic = None
             if f"{name}_systematic" in product.names and name != "mueller":
                 planes = product.get(f"{name}_systematic", region.rows)
@@ -232,9 +230,10 @@ class _Image:
         return _Pixels(values.astype(float), errors.astype(float), units, period, correlation, systematic, mean)
 
 
-def product_units(product: Product, name: str) -> str:
-    """Unit of a map; quantities of M that the product does not hold have none."""
-    return product.units(name) if name in product.names else ""
+def _units(product: Product, name: str, index: int) -> str:
+    """Unit of a map; elements over m00 and quantities that the product does not hold have none."""
+    is_ratio = name == "mueller" and index > 0
+    return "" if is_ratio or name not in product.names else product.units(name)
 
 
 def _element(index: int, light: bool) -> str:

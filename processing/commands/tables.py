@@ -56,7 +56,7 @@ def table_command(
     typer.echo(f"  {', '.join(table.quantities[:4])}{' ...' if len(table.quantities) > 4 else ''}")
     for part, values in table.uncertainties.items():
         typer.echo(f"  {part}, median over bins and quantities: {np.nanmedian(values):.3g}")
-    if table.units:
+    if table.scale_u is not None:
         typer.echo(f"  BRDF in 1/sr; relative standard uncertainty of its scale {100 * table.scale_u:.2g} %")
     typer.echo(f"  bins filled: {table.bins.size} of {91 * 91 * 360}, samples: {int(table.count.sum())}")
     typer.echo(str(out))

@@ -15,7 +15,7 @@ from processing.errors import ProcessError
 from processing.geometry.frames import ScatteringGeometry
 from processing.geometry.viewing import ViewingGeometry
 from processing.maps.stokes_vector import moves_of_light
-from processing.reduction.sent_light import sent_rows
+from processing.reduction.sent_light import light_of, sent_parts, sent_rows
 from processing.reduction.systematic import Systematic
 from processing.reflectance.material_fit import MaterialFit, fit_values
 from processing.storage.products.images import SMALLEST, MuellerImage, StokesImage
@@ -109,12 +109,13 @@ def _of_mueller(source: Path, view: ViewingGeometry) -> _Data:
     values, rows = determined_values(image)
     moved, inputs = [], () if systematic is None else systematic.labels
     if systematic is not None:
-        seen = image.seen if image.sent is None else np.repeat(np.isfinite(image.sent).any(axis=(1, 2)), 4)
-        seen = seen if image.sent is None else seen & (np.arange(16) % 4 == 0)
-        moves = moves_of_light(systematic, image).reshape(len(inputs), 16, -1)[:, seen]
+        moves = moves_of_light(systematic, image).reshape(len(inputs), 4, 4, -1)
         for direction, move in zip(systematic.directions, moves, strict=True):
-            own = rows if image.sent is None else sent_rows(direction.rows)[seen[::4]]
-            moved.append((values + move, own))
+            if image.sent is None:
+                moved.append((values + move.reshape(16, -1)[image.seen], rows))
+            else:
+                seen = sent_parts(image.sent)
+                moved.append((values + move[seen, 0], sent_rows(direction.rows)[seen]))
     return _Data(points, values, rows, covariance_by_light(image, rows), inputs, moved)
 
 
@@ -125,7 +126,7 @@ def determined_values(image: MuellerImage) -> tuple[NDArray[np.float64], NDArray
     """
     if image.sent is None:
         return image.values.reshape(16, -1)[image.seen].astype(float), np.eye(16)[image.seen]
-    seen = np.isfinite(image.sent).any(axis=(1, 2))
+    seen = sent_parts(image.sent)
     return image.sent.reshape(4, -1)[seen].astype(float), sent_rows(image.w)[seen]
 
 
@@ -165,8 +166,7 @@ def _of_stokes(source: Path, view: ViewingGeometry) -> _Data:
 
 def stokes_rows(w: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rows (3, 16) that lead from M to the linear Stokes vector that analyzers without S3 find, of W (channels, 16)."""
-    light = np.linalg.svd(w.reshape(-1, 4), full_matrices=False)[2][0]
-    light /= light[0]
+    light = light_of(w)
     analyzers = (w.reshape(-1, 4, 4) @ light)[:, :3] / (light @ light)
     return np.asarray(np.linalg.pinv(analyzers) @ w)
 

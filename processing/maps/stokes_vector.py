@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from processing.arrays import BoolArray
 from processing.maps.intervals import moves_of
 from processing.maps.partial_quantities import determined_maps, partial_block, partial_facts
-from processing.reduction.sent_light import sent_rows
+from processing.reduction.sent_light import sent_parts, sent_rows
 from processing.reduction.systematic import Systematic
 from processing.storage.products.images import SMALLEST, MuellerImage, seen_elements
 from processing.storage.products.product import COMPANIONS, LIT_ERRORS, Plane, Product, ProductWriter
@@ -64,7 +64,7 @@ def light_of(image: MuellerImage, stokes_errors: NDArray[np.float32] | None) -> 
     w[:, ::4] = image.w[:, ::4]
     values, errors = (np.full_like(image.values, np.nan) for _ in range(2))
     values[:, 0], errors[:, 0] = image.sent, stokes_errors
-    determined = ", ".join(f"m{k}0" for k in np.flatnonzero(np.isfinite(image.sent).any(axis=(1, 2))))
+    determined = ", ".join(f"m{k}0" for k in np.flatnonzero(sent_parts(image.sent)))
     return replace(
         image,
         values=values,
@@ -92,7 +92,7 @@ def light_planes(product: Product) -> dict[str, Plane]:
     seen = seen_elements(product.facts)
     if "stokes" in product.names:
         seen = np.zeros(16, dtype=bool)
-        seen[::4] = np.isfinite(product.get("stokes")).any(axis=(1, 2))
+        seen[::4] = sent_parts(product.get("stokes"))
     names = [NAMES[name] for name in light_quantities(seen)]
     stokes = Plane((4,), "count", f"Stokes vector, S1 {_AXIS}, S3 positive: right circular; NaN: not determined")
     return {"stokes": stokes, **dict(names), "stokes_covariance": _COVARIANCE, "lit": _LIT}

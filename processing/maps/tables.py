@@ -121,7 +121,7 @@ def _table_for(product: Product, layout: Layout, white: WhiteReference | None) -
         frames=frames,
         has_noise=has_noise,
         inputs=inputs if white is None else (*inputs, SCALE),
-        scale_u=np.nan if white is None else white.u,
+        scale_u=None if white is None else white.u,
     )
 
 
@@ -133,7 +133,7 @@ def _require_alike(source: Path, own: ScatteringTable, table: ScatteringTable) -
         )
     if table.quantities != own.quantities:
         raise ProcessError(f"{source} has {own.quantities[0]}, the table has {table.quantities[0]}. Make one of each.")
-    if repr(table.scale_u) != repr(own.scale_u):
+    if table.scale_u != own.scale_u:
         raise ProcessError(f"{source}: the table has another absolute scale. Use the same --white for all images.")
     if (table.has_noise, table.inputs) != (own.has_noise, own.inputs):
         raise ProcessError(

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from processing.arrays import Array
+from processing.doors import one_line, read_text
 from processing.errors import ProcessError
 from processing.geometry.frames import GeometryImage, dot
 from processing.geometry.viewing import ViewingGeometry
@@ -23,7 +24,7 @@ SCALE = "absolute scale"
 class Certified(BaseModel):
     """Reflectance factor at one wavelength: radiance over that of a perfect diffuser, for unpolarized light."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     value: float = Field(gt=0, description="reflectance factor")
     u: float = Field(ge=0, description="its standard uncertainty, k = 1")
@@ -32,7 +33,7 @@ class Certified(BaseModel):
 class Certificate(BaseModel):
     """What a calibration laboratory states of a white plaque."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     incidence_deg: float = Field(ge=0, lt=90, description="angle of incidence, degrees")
     viewing_deg: float = Field(ge=0, lt=90, description="viewing angle, degrees")
@@ -49,16 +50,16 @@ class Certificate(BaseModel):
         """
         if path.suffix.lower() != ".csv":
             return load_yaml(path, cls)
+        text = read_text(path)
         try:
-            with path.open(newline="", encoding="utf-8") as file:
-                rows = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
+            rows = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(text.splitlines())]
             (angles,) = {(row["incidence_deg"], row["viewing_deg"]) for row in rows}
             values = {row["wavelength_nm"]: Certified(value=row["reflectance"], u=row["u"]) for row in rows}
             return cls(incidence_deg=angles[0], viewing_deg=angles[1], reflectance=values)
-        except (OSError, KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise ProcessError(
-                f"{path} cannot be read as a certificate ({error}). Give the columns wavelength_nm, reflectance, u, "
-                "incidence_deg and viewing_deg, with one pair of angles."
+                f"{path} cannot be read as a certificate ({one_line(error)}). Give the columns wavelength_nm, "
+                "reflectance, u, incidence_deg and viewing_deg, with one pair of angles."
             ) from error
 
 

@@ -20,6 +20,7 @@ from processing.polarization.eigenvalue_noise import EigenvalueNoise, corrected
 from processing.polarization.xi0 import Xi0Estimate, estimate
 from processing.reduction.mosaic.demosaic import method_of
 from processing.reduction.mueller import Progress
+from processing.reduction.sent_light import sent_parts
 from processing.reduction.systematic import INPUTS, Systematic
 from processing.reflectance.base import load_reflectance
 from processing.storage.captures.schema import CaptureHeader
@@ -221,7 +222,7 @@ def xi0_of_partial(
     with Product(source) as product:
         product.require("mueller")
         image, systematic = MuellerImage.of(product), Systematic.of_product(product)
-    known = image.seen if image.sent is None else np.isfinite(image.sent).any(axis=(1, 2))
+    known = image.seen if image.sent is None else sent_parts(image.sent)
     if known.sum() < 2:
         raise ProcessError(f"{source} determines {image.facts['determined']}, and xi0 needs two numbers or more.")
     m0 = dominant_model(image.header, geometry_file, material_file, image.mask.shape)

@@ -27,10 +27,20 @@ PLANES = {
 ALIKE = 1e-6
 
 
+def light_of(w: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Stokes vector (4,) of the light on the sample, of intensity 1, where it is one for all rows of W (N, 16)."""
+    light = np.linalg.svd(w.reshape(-1, 4), full_matrices=False)[2][0]
+    return np.asarray(light / light[0], dtype=float)
+
+
 def sent_rows(w: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rows (4, 16) that lead from M to the Stokes vector sent back, for a light of intensity 1, of W (N, 16)."""
-    light = np.linalg.svd(w.reshape(-1, 4), full_matrices=False)[2][0]
-    return np.kron(np.eye(4), light / light[0])
+    return np.asarray(np.kron(np.eye(4), light_of(w)), dtype=float)
+
+
+def sent_parts(sent: NDArray[np.floating]) -> BoolArray:
+    """Which of S0 to S3 of an image (4, rows, columns) of the light sent back are determined, (4,)."""
+    return np.asarray(np.isfinite(sent).any(axis=(1, 2)))
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,7 @@ def export(
     fields["theta_d"][0] = np.deg2rad(axes.theta_d_deg)
     fields["phi_d"][0] = np.deg2rad(axes.phi_d_deg)
     fields["wvls"][...] = wavelengths
-    fields["scale_u"][...] = [ordered[source].scale_u for source in slots]
+    fields["scale_u"][...] = [np.nan if (u := ordered[source].scale_u) is None else u for source in slots]
     missing, written = 0.0, 0
     for k, table in enumerate(ordered):
         blocks = {}

@@ -53,7 +53,7 @@ class ScatteringTable:
     frames : axes to which Mueller elements refer: "instrument", "renderer" or "" for scalars.
     has_noise : whether samples come with the variance of their noise.
     inputs : uncertain inputs of the instrument; samples come with what one standard uncertainty of each does to them.
-    scale_u : standard uncertainty of the absolute scale over itself; NaN: values are in counts, not a BRDF in 1/sr.
+    scale_u : standard uncertainty of the absolute scale over itself; None: values are in counts, not a BRDF in 1/sr.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class ScatteringTable:
         frames: str = "",
         has_noise: bool = False,
         inputs: tuple[str, ...] = (),
-        scale_u: float = np.nan,
+        scale_u: float | None = None,
     ) -> None:
         self.quantities = quantities
         self.wavelength_nm = float(wavelength_nm)
@@ -75,7 +75,7 @@ class ScatteringTable:
         self.frames = frames
         self.has_noise = has_noise
         self.inputs = inputs
-        self.scale_u = float(scale_u)
+        self.scale_u = scale_u
         self._row = np.full(SHAPE[0] * SHAPE[1] * SHAPE[2], -1, dtype=np.int32)
         self.bins = np.empty(0, dtype=np.int32)
         self.count = np.empty(0, dtype=np.int64)
@@ -126,7 +126,7 @@ class ScatteringTable:
     @property
     def units(self) -> str:
         """Of the values: 1/sr of a BRDF, or empty."""
-        return "1/sr" if np.isfinite(self.scale_u) else ""
+        return "" if self.scale_u is None else "1/sr"
 
     @property
     def planes(self) -> int:
@@ -182,7 +182,7 @@ class ScatteringTable:
     def merge(self, other: ScatteringTable) -> None:
         """Add all samples of another table of the same quantities, wavelength and layout. Raises TableError."""
         mine, theirs = (
-            (t.quantities, t.wavelength_nm, t.axes, t.simulated, t.frames, t.has_noise, t.inputs, repr(t.scale_u))
+            (t.quantities, t.wavelength_nm, t.axes, t.simulated, t.frames, t.has_noise, t.inputs, t.scale_u)
             for t in (self, other)
         )
         if mine != theirs:
@@ -216,7 +216,8 @@ class ScatteringTable:
             h5.attrs["wavelength_nm"] = self.wavelength_nm
             h5.attrs["layout"] = self.axes.layout
             h5.attrs["simulated"] = self.simulated
-            h5.attrs["scale_u"] = self.scale_u
+            if self.scale_u is not None:
+                h5.attrs["scale_u"] = self.scale_u
             h5.attrs["frames"] = self.frames
             h5.attrs.update({"quantities": list(self.quantities), "inputs": list(self.inputs), "default": "entry"})
             entry = add_group(h5, "entry", "NXentry")
@@ -324,7 +325,7 @@ class ScatteringTable:
                 frames=str(a["frames"]),
                 has_noise=has_noise,
                 inputs=tuple(inputs),
-                scale_u=float(a.get("scale_u", np.nan)),
+                scale_u=float(a["scale_u"]) if "scale_u" in a else None,
             )
             if not np.allclose(sums["theta_h_deg"][...], table.axes.theta_h_deg):
                 raise TableError(f"{path}: its theta_h axis is not that of layout {a['layout']!r}")

@@ -18,6 +18,7 @@ def table_section(path: Path) -> Section:
     """Numbers of a table, its first quantity over theta_h and theta_d, averaged over phi_d, and its uncertainties."""
     table = ScatteringTable.load(path)
     name = table.quantities[0]
+    scale = [] if (u := table.scale_u) is None else [("scale", f"BRDF in 1/sr, relative standard uncertainty {u:.2g}")]
     summary = [
         ("kind", f"table over theta_h, theta_d, phi_d, {'simulated' if table.simulated else 'measured'}"),
         ("quantities", ", ".join(table.quantities)),
@@ -25,7 +26,7 @@ def table_section(path: Path) -> Section:
         ("layout", table.axes.layout),
         ("bins filled", f"{table.bins.size} of {SHAPE[0] * SHAPE[1] * (SHAPE[2] - 1)}"),
         ("samples", str(int(table.count.sum()))),
-        *([("scale", f"BRDF in 1/sr, relative standard uncertainty {table.scale_u:.2g}")] if table.units else []),
+        *scale,
         ("uncertain in the instrument", "; ".join(table.inputs) or "nothing stated"),
         *(
             (f"{part} of a bin's mean {name}, median", f"{np.nanmedian(values[0]):.3g}")

@@ -1,5 +1,6 @@
 """Absolute scale: counts of a white plaque with a certificate turn a table into a BRDF in 1/sr."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from processing.geometry.frames import dot
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
+from processing.maps.white_reference import Certificate
 from processing.reduction.mueller import reduce_mueller
 from processing.reflectance import pbsdf
 from processing.reflectance.tables import ScatteringTable
@@ -135,3 +137,17 @@ def test_what_has_no_scale_is_refused(bench, white):
     another = bench.product("another", bench.sphere, BRDF / 2)
     with pytest.raises(ProcessError, match="another absolute scale"):
         Tabulation((another,), bench.sphere, bench.folder / "t.h5", "renderer").append()
+
+
+@pytest.mark.parametrize("reflectance", ["inf", "nan", "white"])
+def test_a_certificate_has_finite_numbers(tmp_path, reflectance):
+    path = tmp_path / "certificate.csv"
+    path.write_text(f"wavelength_nm,reflectance,u,incidence_deg,viewing_deg\n662,{reflectance},0.01,0,45\n")
+    with pytest.raises(ProcessError, match="cannot be read as a certificate"):
+        Certificate.load(path)
+
+
+def test_a_pipe_is_no_certificate(tmp_path):
+    os.mkfifo(tmp_path / "certificate.csv")
+    with pytest.raises(ProcessError, match="certificate"):
+        Certificate.load(tmp_path / "certificate.csv")

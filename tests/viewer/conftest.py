@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from playwright.sync_api import Page, expect
 from starlette.testclient import TestClient
 
 from processing.instrument.model import InstrumentModel
@@ -83,3 +84,24 @@ def address(lab: Path) -> Iterator[str]:
     for job in lab.glob(".umov-view/jobs/*/job.json"):
         if not (job.parent / "code").exists():
             os.kill(json.loads(job.read_text())["pid"], signal.SIGKILL)
+
+
+@pytest.fixture
+def draw_region() -> Callable[..., None]:
+    """Draws a rectangle on the frame of a page, by shares of its width and height, with the button and the mouse."""
+
+    def draw(page: Page, first: tuple[float, float], last: tuple[float, float]) -> None:
+        page.locator("#region").click()
+        expect(page.locator("#region")).to_have_attribute("aria-pressed", "true")
+        box = page.locator("#frame .nsewdrag").first.bounding_box()
+        assert box is not None
+        (x0, y0), (x1, y1) = (
+            (box["x"] + box["width"] * across, box["y"] + box["height"] * down) for across, down in (first, last)
+        )
+        page.mouse.move(x0, y0)
+        page.mouse.down()
+        page.mouse.move(x1, y1, steps=4)
+        page.mouse.up()
+        expect(page.locator("#pixel")).to_have_text(re.compile(r"\(\d+ pixels\)"))
+
+    return draw

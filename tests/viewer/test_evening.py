@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import urllib.parse
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -126,14 +127,14 @@ def test_an_alarm_that_comes_while_a_page_is_open_is_shown_and_acknowledged(own_
 
 
 @pytest.mark.long
-def test_a_whole_evening(lab, address, window):
+def test_a_whole_evening(lab, address, window, draw_region):
     page = window()
     page.goto(f"{address}/")
     expect(page.get_by_text("cannot be opened as HDF5")).to_be_visible()
 
     _start_watch_stop_resume(page, window(), lab, address)
     capture = "evening/001_red_sphere_drr_662nm_omega35.h5"
-    _look_and_probe(page, address, capture)
+    _look_and_probe(page, address, capture, draw_region)
     _diagnose_and_accept(page, lab)
     _compare_before_and_after(page, lab, address, capture)
     _narrow_and_dark(page, address, capture)
@@ -192,7 +193,7 @@ def _ended(lab: Path) -> None:
     assert codes <= {"130"}, codes
 
 
-def _look_and_probe(page: Page, address: str, capture: str) -> None:
+def _look_and_probe(page: Page, address: str, capture: str, draw_region: Callable[..., None]) -> None:
     page.goto(f"{address}/?q=omega+35+complete")
     page.get_by_role("link", name=capture).click()
     ready(page)
@@ -211,15 +212,7 @@ def _look_and_probe(page: Page, address: str, capture: str) -> None:
     page.mouse.click(box["x"] + box["width"] * 0.55, box["y"] + box["height"] * 0.45)
     expect(page.locator("#pixel")).to_have_text(re.compile(r"column 6\d, row 5\d"))
     keep(page, "capture")
-    page.locator("#region").click()
-    expect(page.locator("#region")).to_have_attribute("aria-pressed", "true")
-    box = page.locator("#frame .nsewdrag").first.bounding_box()
-    assert box is not None
-    page.mouse.move(box["x"] + box["width"] * 0.5, box["y"] + box["height"] * 0.4)
-    page.mouse.down()
-    page.mouse.move(box["x"] + box["width"] * 0.6, box["y"] + box["height"] * 0.5, steps=4)
-    page.mouse.up()
-    expect(page.locator("#pixel")).to_have_text(re.compile(r"\(\d+ pixels\)"))
+    draw_region(page, (0.5, 0.4), (0.6, 0.5))
     scale = page.locator("#frame .cbaxis")
     # A capture opens stretched: its light ends well below the full scale.
     expect(scale).not_to_contain_text("4000")

@@ -154,7 +154,7 @@ def test_an_error_has_two_digits_and_its_value_ends_with_it(client, browser, add
     assert shown == text
 
 
-def test_a_browser_keeps_a_region_and_finds_it_on_another_capture(lab, drr_capture, address, browser):
+def test_a_browser_keeps_a_region_and_finds_it_on_another_capture(lab, drr_capture, address, browser, draw_region):
     Reduction(drr_capture("one.h5")).make()
     drr_capture("two.h5", seed_of_noise=2)
     page = browser.new_page(viewport={"width": 1400, "height": 900})
@@ -164,15 +164,7 @@ def test_a_browser_keeps_a_region_and_finds_it_on_another_capture(lab, drr_captu
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.goto(f"{address}/capture?file=one.h5")
     page.locator("body[data-ready]").wait_for()
-    page.locator("#region").click()
-    expect(page.locator("#region")).to_have_attribute("aria-pressed", "true")
-    box = page.locator("#frame .nsewdrag").first.bounding_box()
-    assert box is not None
-    page.mouse.move(box["x"] + box["width"] * 0.3, box["y"] + box["height"] * 0.3)
-    page.mouse.down()
-    page.mouse.move(box["x"] + box["width"] * 0.7, box["y"] + box["height"] * 0.7, steps=4)
-    page.mouse.up()
-    expect(page.locator("#pixel")).to_have_text(re.compile(r"\(\d+ pixels\)"))
+    draw_region(page, (0.3, 0.3), (0.7, 0.7))
     page.get_by_label("Name of the region").fill("spot")
     page.get_by_role("button", name="Keep", exact=True).click()
     page.locator("#region-table").get_by_text("spot").wait_for()
