@@ -93,7 +93,7 @@ def _show_effect(short: Mapping[str, str], number: int, effect: FoundEffect, noi
     )
     _say(short, f"{number}. {effect.kind}{where} ({_answer(effect)}): {values}")
     if effect.residual_without is not None and effect.residual_with is not None:
-        _say(short, f"   residual {effect.residual_without.told_beside(effect.residual_with)}{noise}")
+        _say(short, f"   residual without it {effect.residual_without.told_beside(effect.residual_with)}{noise}")
     _say(short, f"   not applied, because {effect.not_applied}" if effect.not_applied else "   applied")
 
 
