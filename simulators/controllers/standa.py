@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 
 from drivers.axes.standa import (
@@ -25,10 +26,20 @@ STEPS_PER_DEG = 100
 MICROSTEP_MODE = 9
 MICROSTEPS = 256
 SERIAL_NUMBER = 27_182
-MOVE, MOVE_BY, STOP, SOFT_STOP = 1, 2, 5, 8
+MOVE, MOVE_BY, LEFT, RIGHT, STOP, LOOSEN, SOFT_STOP = 1, 2, 3, 4, 5, 7, 8
+SET_POSITION, IGNORE_POSITION = struct.Struct("<ihqB5x"), 0x01
 NO_FEEDBACK, INTEGRATED_DRIVER = 5, 2
 LIMITED_SPEED_WITH_RAMPS = 0x90
 GAP_S = 0.4
+# Bytes behind the letters of what the maker's library sets and reads back, and nothing here acts on.
+KEPT = {
+    b"pwr": 14, b"sec": 22, b"pid": 42, b"sni": 22, b"sno": 10, b"eio": 12, b"brk": 19, b"ctl": 87, b"joy": 16,
+    b"ctp": 12, b"urt": 10, b"nmf": 24, b"nvm": 30, b"emf": 42, b"eas": 48, b"est": 40, b"nme": 24,
+}  # fmt: skip
+# Answered with the letters alone, and without effect on the angle: power, memory, measurement.
+TAKEN = frozenset((b"pwof", b"save", b"read", b"sars", b"rers", b"eesv", b"eerd", b"stms"))
+# Bytes of what is read only: measurements, chart.
+READ_ONLY = {b"getm": 210, b"getc": 32}
 
 
 class StandaEmulator(Emulator):
@@ -63,6 +74,7 @@ class StandaEmulator(Emulator):
         self._zero_deg = axis.mechanical_deg()
         self._buffer = bytearray()
         self._last_byte_s = 0.0
+        self._kept = {name: bytes(size) for name, size in KEPT.items()}
         speed, acceleration = (
             round(value * STEPS_PER_DEG) for value in (axis.speed_deg_s, min(axis.acceleration_deg_s2, 600.0))
         )
@@ -101,23 +113,36 @@ class StandaEmulator(Emulator):
         layout = LAYOUTS.get(b"g" + letters[1:]) if letters[:1] == b"s" else None
         if letters in (b"move", b"movr"):
             layout = LAYOUTS[b"move"]
-        size = 0 if layout is None else layout.size + 2
+        elif letters == b"spos":
+            layout = SET_POSITION
+        if letters[:1] == b"s" and letters[1:] in KEPT:
+            size = KEPT[letters[1:]] + 2
+        elif letters == b"asia":
+            size = 18
+        else:
+            size = 0 if layout is None else layout.size + 2
         if len(self._buffer) < 4 + size:
             return False
         data = bytes(self._buffer[4 : 4 + size])
         del self._buffer[: 4 + size]
         self._apply_faults()
-        if layout is None:
+        if not data:
             self._reply(self._answer(letters))
         elif checksum(data[:-2]) != data[-2:]:
             self._reply(WRONG_CHECKSUM)
+        elif layout is None:
+            if letters != b"asia":
+                self._kept[letters[1:]] = data[:-2]
+            self._reply(letters)
         else:
             self._reply(self._set(letters, layout.unpack(data[:-2])))
         return True
 
     def _answer(self, letters: bytes) -> bytes:
-        if letters in ECHOED:
+        if letters in ECHOED or letters in (b"left", b"rigt", b"loft"):
             self._act(letters)
+            return letters
+        if letters in TAKEN:
             return letters
         questions: dict[bytes, Callable[[], tuple[object, ...]]] = {
             b"gets": self._status,
@@ -125,9 +150,16 @@ class StandaEmulator(Emulator):
             b"geti": lambda: (b"XIMC", b"SM", b"8SMC5-US", 2, 3, 0),
             b"gser": lambda: (SERIAL_NUMBER,),
             b"gfwv": lambda: (4, 7, 8),
+            b"gblv": lambda: (4, 0, 9),
         }
         if letters in questions:
-            return message(letters, LAYOUTS[letters].pack(*questions[letters]()))
+            # Both versions have one layout.
+            layout = LAYOUTS[b"gfwv" if letters == b"gblv" else letters]
+            return message(letters, layout.pack(*questions[letters]()))
+        if letters in READ_ONLY:
+            return message(letters, bytes(READ_ONLY[letters]))
+        if letters[:1] == b"g" and letters[1:] in self._kept:
+            return message(letters, self._kept[letters[1:]])
         if letters[:1] == b"g" and letters[1:] in self.settings:
             return message(letters, LAYOUTS[letters].pack(*self.settings[letters[1:]]))
         return UNKNOWN_COMMAND
@@ -157,9 +189,12 @@ class StandaEmulator(Emulator):
             return
         if letters == b"home":
             self.axis.home(self.settings[b"hom"][0] / STEPS_PER_DEG)
+        elif letters in (b"left", b"rigt"):
+            self.axis.run(self.axis.speed_deg_s if letters == b"rigt" else -self.axis.speed_deg_s)
         else:
             self.axis.stop()
-        self._command_name = {b"home": HOME, b"stop": STOP, b"sstp": SOFT_STOP}[letters]
+        names = {b"home": HOME, b"stop": STOP, b"sstp": SOFT_STOP, b"left": LEFT, b"rigt": RIGHT, b"loft": LOOSEN}
+        self._command_name = names[letters]
 
     def _set(self, letters: bytes, values: tuple[int, ...]) -> bytes:
         if letters in (b"move", b"movr"):
@@ -167,6 +202,10 @@ class StandaEmulator(Emulator):
             self._move_to(by_deg + (self.count_deg() if letters == b"movr" else 0.0))
             if not self.alarm:
                 self._command_name = MOVE if letters == b"move" else MOVE_BY
+        elif letters == b"spos":
+            if not values[3] & IGNORE_POSITION and not self.axis.is_moving():
+                called_deg = (values[0] + values[1] / MICROSTEPS) / STEPS_PER_DEG
+                self._zero_deg = self.axis.mechanical_deg() - called_deg
         elif letters == b"smov":
             if values[0] > 100_000 or 0 in values[2:4]:
                 return WRONG_VALUE

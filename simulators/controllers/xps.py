@@ -17,6 +17,8 @@ from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
 
 WRONG_FORMAT, OUT_OF_RANGE, NO_GROUP, NOT_ALLOWED, UNKNOWN, ABORTED = -2, -17, -19, -22, -3, -27
+# The controller's servo cycle; gathering takes a sample in each, or in each n-th.
+CYCLE_S = 125e-6
 END = ",EndOfAPI"
 _CALL = re.compile(r"\s*(\w+)\((.*)\)")
 
@@ -54,6 +56,25 @@ class PositionCompare:
 
 
 @dataclass
+class Gathering:
+    """Positions and velocities taken in the servo's cycle; `types` are what is taken, by axis and name."""
+
+    types: list[tuple[EmulatedAxis, str]] = field(default_factory=list)
+    samples: list[tuple[float, ...]] = field(default_factory=list)
+    wanted: int = 0
+    every_s: float = 0.0
+    start_s: float = 0.0
+
+    def look(self, now_s: float) -> None:
+        """Take what is due by now; no motion began since the last look."""
+        while len(self.samples) < self.wanted:
+            due_s = self.start_s + len(self.samples) * self.every_s
+            if due_s > now_s:
+                return
+            self.samples.append(tuple(axis.at(due_s)[name == "CurrentVelocity"] for axis, name in self.types))
+
+
+@dataclass
 class Group:
     """A group with one positioner, `name`.Pos."""
 
@@ -63,10 +84,14 @@ class Group:
     enabled: bool = True
     came_by: int = 11
     aborted: bool = False
+    jogs: bool = False
+    jog: tuple[float, float] = (0.0, 0.0)
     compare: PositionCompare = field(default_factory=PositionCompare)
 
     def status(self) -> int:
         """Status code of GroupStatusGet."""
+        if self.jogs:
+            return 47
         if self.axis.is_moving():
             return 43 if self.axis.homing else 44
         if not self.initialized:
@@ -87,6 +112,7 @@ class XPSEmulator(Emulator):
     def __init__(self, groups: Sequence[Group], clock: Clock, faults: FaultSchedule | None = None) -> None:
         super().__init__([group.axis for group in groups], clock, faults)
         self.groups = {group.name: group for group in groups}
+        self.gathering = Gathering()
 
     def connect(self) -> XPSConversation:
         """Begin a conversation."""
@@ -118,6 +144,7 @@ class XPSConversation(Emulator):
         while self._waits_for is None and (end := self._buffer.find(")")) >= 0:
             text, self._buffer = self._buffer[: end + 1], self._buffer[end + 1 :]
             self._apply_faults()
+            self._controller.gathering.look(self.clock.now_s())
             try:
                 answer = self._run(text)
             except Failed as failure:
@@ -140,6 +167,8 @@ class XPSConversation(Emulator):
         if name == "ObjectsListGet":
             groups = self._controller.groups
             return f"{';'.join(groups)};;{';'.join(f'{group}.Pos' for group in groups)}"
+        if name.startswith("Gathering"):
+            return self._gather(name.removeprefix("Gathering"), words)
         functions: dict[str, Callable[[Group, list[str]], str | None]] = {
             "GroupStatusGet": lambda group, _: str(group.status()),
             "GroupPositionCurrentGet": lambda group, _: f"{group.axis.position_deg():.9g}",
@@ -156,6 +185,11 @@ class XPSConversation(Emulator):
             "GroupKill": self._kill,
             "GroupMotionEnable": lambda group, _: self._enable(group, True),
             "GroupMotionDisable": lambda group, _: self._enable(group, False),
+            "GroupJogModeEnable": lambda group, _: self._switch_jog(group, True),
+            "GroupJogModeDisable": lambda group, _: self._switch_jog(group, False),
+            "GroupJogParametersSet": self._jog,
+            "GroupJogParametersGet": lambda group, _: f"{group.jog[0]:.9g},{group.jog[1]:.9g}",
+            "GroupJogCurrentGet": lambda group, _: f"{group.axis.velocity_deg_s():.9g},{group.jog[1]:.9g}",
             "PositionerPositionCompareSet": self._set_compare,
             "PositionerPositionCompareGet": lambda group, _: _compare(group.compare),
             "PositionerPositionCompareEnable": lambda group, _: self._switch_compare(group, True),
@@ -183,10 +217,7 @@ class XPSConversation(Emulator):
     def _move(self, group: Group, words: list[str], from_deg: float = 0.0) -> None:
         if not 10 <= group.status() <= 18:
             raise Failed(NOT_ALLOWED)
-        try:
-            target_deg = from_deg + float(words[0])
-        except (ValueError, IndexError):
-            raise Failed(WRONG_FORMAT) from None
+        target_deg = from_deg + _numbers(words, 1)[0]
         if not group.axis.within(target_deg):
             raise Failed(OUT_OF_RANGE)
         group.axis.move_to(target_deg)
@@ -202,7 +233,7 @@ class XPSConversation(Emulator):
     def _kill(self, group: Group, _: list[str]) -> str:
         group.aborted = group.axis.is_moving()
         group.axis.lose_reference()
-        group.initialized = False
+        group.initialized = group.jogs = False
         return ""
 
     def _enable(self, group: Group, on: bool) -> str:
@@ -211,11 +242,65 @@ class XPSConversation(Emulator):
         group.enabled, group.came_by = on, 10
         return ""
 
+    def _switch_jog(self, group: Group, on: bool) -> str:
+        allowed = 10 <= group.status() <= 18 if on else group.jogs and not group.axis.is_moving()
+        if not allowed:
+            raise Failed(NOT_ALLOWED)
+        group.jogs, group.jog, group.came_by = on, (0.0, group.axis.acceleration_deg_s2), 15
+        return ""
+
+    def _jog(self, group: Group, words: list[str]) -> str:
+        velocity_deg_s, acceleration_deg_s2 = _numbers(words, 2)
+        if not group.jogs:
+            raise Failed(NOT_ALLOWED)
+        if abs(velocity_deg_s) > group.axis.speed_deg_s or not 0 < acceleration_deg_s2 <= 1e6:
+            raise Failed(OUT_OF_RANGE)
+        group.jog = (velocity_deg_s, acceleration_deg_s2)
+        if velocity_deg_s:
+            group.axis.run(velocity_deg_s)
+        else:
+            group.axis.stop()
+        return ""
+
+    def _gather(self, name: str, words: list[str]) -> str:
+        gathering, now_s = self._controller.gathering, self.clock.now_s()
+        if name == "ConfigurationSet":
+            self._controller.gathering = Gathering([self._gathered(word) for word in words])
+        elif name == "ConfigurationGet":
+            names = {group.axis: group.name for group in self._controller.groups.values()}
+            return ";".join(f"{names[axis]}.Pos.{what}" for axis, what in gathering.types)
+        elif name == "Run":
+            if not gathering.types:
+                raise Failed(NOT_ALLOWED)
+            wanted, divisor = _numbers(words, 2)
+            if wanted < 1 or divisor < 1:
+                raise Failed(OUT_OF_RANGE)
+            self._controller.gathering = Gathering(gathering.types, [], int(wanted), divisor * CYCLE_S, now_s)
+        elif name in ("Stop", "StopAndSave"):
+            gathering.wanted = len(gathering.samples)
+        elif name == "Reset":
+            gathering.wanted, gathering.samples = 0, []
+        elif name == "CurrentNumberGet":
+            return f"{len(gathering.samples)},{1_000_000 // max(1, len(gathering.types))}"
+        elif name in ("DataGet", "DataMultipleLinesGet"):
+            first, count = (*_numbers(words[:1], 1), 1) if name == "DataGet" else _numbers(words[:2], 2)
+            lines = gathering.samples[int(first) : int(first + count)]
+            if first < 0 or len(lines) < count:
+                raise Failed(OUT_OF_RANGE)
+            return "".join(f"{';'.join(f'{value:.9g}' for value in line)}\n" for line in lines)
+        else:
+            raise Failed(UNKNOWN)
+        return ""
+
+    def _gathered(self, word: str) -> tuple[EmulatedAxis, str]:
+        """The axis of ``Group1.Pos.CurrentPosition`` and what is gathered of it."""
+        group, _, what = word.partition(".Pos.")
+        if group not in self._controller.groups or what not in ("CurrentPosition", "CurrentVelocity"):
+            raise Failed(WRONG_FORMAT)
+        return self._controller.groups[group].axis, what
+
     def _set_compare(self, group: Group, words: list[str]) -> str:
-        try:
-            low_deg, high_deg, step_deg = (float(word) for word in words)
-        except ValueError:
-            raise Failed(WRONG_FORMAT) from None
+        low_deg, high_deg, step_deg = _numbers(words, 3)
         if group.compare.on or not 10 <= group.status() <= 18:
             raise Failed(NOT_ALLOWED)
         if not (step_deg > 0 and low_deg < high_deg and group.axis.within(low_deg) and group.axis.within(high_deg)):
@@ -231,6 +316,7 @@ class XPSConversation(Emulator):
         return ""
 
     def _do_advance(self) -> None:
+        self._controller.gathering.look(self.clock.now_s())
         for each in self._controller.groups.values():
             each.compare.look(each.axis.position_deg())
         group = self._waits_for
@@ -244,6 +330,16 @@ class XPSConversation(Emulator):
 
     def _do_make_foreign(self, reply: bytes) -> bytes:
         return self._controller._do_make_foreign(reply)
+
+
+def _numbers(words: list[str], count: int) -> list[float]:
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        raise Failed(WRONG_FORMAT) from None
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise Failed(WRONG_FORMAT)
+    return numbers
 
 
 def _limits(axis: EmulatedAxis) -> str:

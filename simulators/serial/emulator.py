@@ -95,6 +95,10 @@ class EmulatedAxis:
         """Present velocity with its sign."""
         return self._motion.velocity(self.clock.now_s())
 
+    def at(self, then_s: float) -> tuple[float, float]:
+        """Reported angle and velocity at a simulated time that lies in the present motion or after it."""
+        return self._motion.position(then_s) - self._origin_deg, self._motion.velocity(then_s)
+
     def within(self, target_deg: float) -> bool:
         """True if a reported angle is inside the travel, to a millionth of a degree."""
         low = -math.inf if self.min_deg is None else self.min_deg - 1e-6

@@ -53,6 +53,34 @@ def test_a_move_of_an_xps_holds_up_its_own_connection_alone() -> None:
     assert motion.take_output() == b"-27,,EndOfAPI0,12,EndOfAPI"
 
 
+def test_jog_and_gathering() -> None:
+    clock = ManualClock()
+    talk = xps_emulator.make(ServeOptions(clock=clock, homed=True, acceleration_deg_s2=100.0)).connect()
+
+    def answer(sent: bytes) -> bytes:
+        talk.receive(sent)
+        return talk.take_output().removesuffix(b",EndOfAPI")
+
+    assert answer(b"GroupJogParametersSet(Group1,5,100)").startswith(b"-22,")
+    assert answer(b"GatheringRun(10,8)").startswith(b"-22,")
+    assert answer(b"GatheringConfigurationSet(Group1.Pos.CurrentPosition,Group1.Pos.CurrentVelocity)") == b"0,"
+    assert answer(b"GroupJogModeEnable(Group1)") == b"0,"
+    assert answer(b"GroupStatusGet(Group1,int *)") == b"0,47"
+    assert answer(b"GroupMoveAbsolute(Group1,5)").startswith(b"-22,")
+    assert answer(b"GroupJogParametersSet(Group1,5,100)") == b"0,"
+    assert answer(b"GatheringRun(3,8000)") == b"0,"
+    clock.sleep_s(1.5)
+    assert answer(b"GatheringCurrentNumberGet(int *,int *)") == b"0,2,500000"
+    assert answer(b"GatheringDataGet(1,char *)") == b"0,4.875;5\n"
+    assert answer(b"GroupJogModeDisable(Group1)").startswith(b"-22,")
+    assert answer(b"GroupJogParametersSet(Group1,0,100)") == b"0,"
+    clock.sleep_s(1.0)
+    assert answer(b"GatheringDataMultipleLinesGet(1,2,char *)") == b"0,4.875;5\n7.5;0\n"
+    assert answer(b"GatheringDataGet(3,char *)").startswith(b"-17,")
+    assert answer(b"GroupJogModeDisable(Group1)") == b"0,"
+    assert answer(b"GroupStatusGet(Group1,int *)") == b"0,15"
+
+
 def test_an_xps_puts_out_a_pulse_at_every_step_that_it_passes() -> None:
     emulator = xps_emulator.make(ServeOptions(clock=Clock(100.0, base=patient_clock()), homed=True))
     with port_for(emulator) as port, LineRegistry(clock=patient_clock()) as lines:

@@ -167,6 +167,17 @@ def test_newport_library_of_the_xps() -> None:
         assert (error, low < 0 < high) == (0, True)
         assert xps.PositionerPositionCompareSet(line, "Group1.Pos", 0, 10, 0.5)[0] == 0
         assert xps.PositionerPositionCompareGet(line, "Group1.Pos")[:4] == [0, 0.0, 10.0, 0.5]
+        assert xps.GatheringConfigurationSet(line, ["Group1.Pos.CurrentPosition"])[0] == 0
+        assert xps.GatheringRun(line, 100, 8)[0] == 0
+        assert xps.GroupJogModeEnable(line, "Group1")[0] == 0
+        assert xps.GroupJogParametersSet(line, "Group1", [20.0], [100.0])[0] == 0
+        wait_until("jog", lambda: emulator.true_deg(0) > 0.0)
+        assert xps.GroupJogParametersSet(line, "Group1", [0.0], [100.0])[0] == 0
+        wait_until("rest", lambda: xps.GroupJogModeDisable(line, "Group1")[0] == 0)
+        assert xps.GatheringCurrentNumberGet(line)[:2] == [0, 100]
+        positions = [float(text) for text in xps.GatheringDataMultipleLinesGet(line, 0, 100)[1].split()]
+        assert positions[0] == pytest.approx(-6.75, abs=0.01)
+        assert positions == sorted(positions)
         xps.TCP_CloseSocket(line)
 
 

@@ -1,5 +1,6 @@
 """Clients that nobody here wrote must be able to drive the emulators; what had to be mended is in docs."""
 
+import re
 import sys
 import time
 from types import ModuleType
@@ -208,5 +209,27 @@ def test_libximc(monkeypatch: pytest.MonkeyPatch) -> None:
             stage.command_sstp()
             stage.command_wait_for_stop(10)
             assert emulator.true_deg(0) < 500.0
+            for turn, sign in ((stage.command_left, -1), (stage.command_right, 1)):
+                here_deg = emulator.true_deg(0)
+                turn()
+                wait_until("motion", lambda sign=sign, here_deg=here_deg: sign * (emulator.true_deg(0) - here_deg) > 1)
+                stage.command_stop()
+                stage.command_wait_for_stop(10)
+            stage.set_position(ximc.set_position_t(500, 64, 0, ximc.PositionFlags.SETPOS_IGNORE_ENCODER))
+            assert stage.get_position().Position == 500
+            stage.command_loft()
+            stage.command_power_off()
+            # Every setting is kept.
+            names = [name for name in dir(stage) if re.fullmatch(r"get_\w+_settings|get_controller_name", name)]
+            assert len(names) >= 15
+            for name in names:
+                kept = getattr(stage, name)()
+                getattr(stage, f"set_{name[4:]}")(kept)
+            power = stage.get_power_settings()
+            power.HoldCurrent = 42
+            stage.set_power_settings(power)
+            assert stage.get_power_settings().HoldCurrent == 42
+            stage.command_save_settings()
+            stage.command_read_settings()
         finally:
             stage.close_device()
