@@ -24,11 +24,12 @@ def register(app: typer.Typer) -> None:
 
 def init(
     out: Annotated[Path, typer.Option(help="rig file to write; an existing one is kept")] = Path("rig.yaml"),
+    micromanager: Annotated[Path | None, typer.Option(help="configuration of Micro-Manager to list")] = None,
 ) -> None:
     """Write a rig file to begin with, from the cameras and serial ports that are there; opens no port."""
     from acquisition.commands.init import write_rig
 
-    typer.echo(write_rig(out))
+    typer.echo(write_rig(out, micromanager))
 
 
 def doctor(

@@ -11,7 +11,8 @@ from acquisition.commands.defaults import CONFIGS
 from acquisition.rig.config import RigConfig
 from drivers.errors import CameraError
 from drivers.registry import Family, device_kinds
-from processing.doors import require_new
+from processing.doors import one_line, read_text_of_any_system, require_new
+from processing.errors import ProcessError
 from processing.whole_file import write_new_text
 from processing.yaml_file import parse_yaml
 
@@ -60,7 +61,42 @@ def found_cameras() -> tuple[list[dict[str, str]], str]:
         return [], " ".join(str(error).split())
 
 
-def rig_text(name: str, cameras: Sequence[dict[str, str]], ports: Iterable[FoundPort], why_no_camera: str = "") -> str:
+def configured_devices(configuration: Path) -> list[tuple[str, str]]:
+    """Label and adapter of every device in a configuration of Micro-Manager, which is read and not loaded.
+
+    Raises
+    ------
+    ProcessError
+        It cannot be read, or has no device.
+    """
+    lines = [line.strip().split(",") for line in read_text_of_any_system(configuration).splitlines()]
+    devices = [(words[1], " ".join(words[2:])) for words in lines if words[0] == "Device" and len(words) == 4]
+    if not devices:
+        raise ProcessError(f"{configuration}: it has no line `Device,LABEL,ADAPTER,NAME`. Save it in Micro-Manager")
+    return devices
+
+
+def _from_core(configuration: Path | None) -> list[str]:
+    """How a device of a core of Micro-Manager would be written as an axis or as the camera, as comments."""
+    if configuration is None:
+        return []
+    path = one_line(configuration.absolute())
+    return [
+        f"# In {one_line(configuration.name)}; a stage is an axis, a camera the camera:",
+        *(f"#  {one_line(label)}: {one_line(adapter)}" for label, adapter in configured_devices(configuration)),
+        f"#  NAME: {{kind: mmcore, device: LABEL, configuration: {path}, speed_deg_s: ...}}",
+        f"#  camera: {{kind: mmcore, device: LABEL, configuration: {path}}}",
+    ]
+
+
+def rig_text(
+    name: str,
+    cameras: Sequence[dict[str, str]],
+    ports: Iterable[FoundPort],
+    *,
+    why_no_camera: str = "",
+    configuration: Path | None = None,
+) -> str:
     """A rig file as text: what was found, what can be chosen, and what only a person knows, each with a comment.
 
     Raises
@@ -82,6 +118,7 @@ def rig_text(name: str, cameras: Sequence[dict[str, str]], ports: Iterable[Found
         "axes: {}",
         *(line for port in axes for line in _axis(port)),
         *([] if axes else ["#  no serial port of a USB adapter was found"]),
+        *_from_core(configuration),
         "",
         *_camera(cameras, why_no_camera),
         "",
@@ -142,16 +179,16 @@ def _camera(cameras: Sequence[dict[str, str]], why_none: str) -> list[str]:
     return lines
 
 
-def write_rig(path: Path) -> str:
-    """Look for devices, write the file, tell what was found.
+def write_rig(path: Path, configuration: Path | None = None) -> str:
+    """Look for devices, also in a configuration of Micro-Manager, write the file, tell what was found.
 
     Raises
     ------
     ProcessError
-        A file of that name exists, or there is no such folder.
+        A file of that name exists, there is no such folder, or the configuration cannot be read.
     """
     require_new(path)
     (cameras, why), ports = found_cameras(), found_ports()
-    text = rig_text(path.stem, cameras, ports, why)
+    text = rig_text(path.stem, cameras, ports, why_no_camera=why, configuration=configuration)
     write_new_text(path, text)
     return f"{path}: {len(cameras)} camera(s), {len(ports)} serial port(s). Fill in the axes, then acquire doctor --rig"

@@ -3,7 +3,7 @@
 Facts: the interface of MMCore. It knows stages of one dimension in micrometres, so the rig file says how many of them a
 degree is; it tells neither speed nor limits, whether the stage is homed, nor what is wrong with it. A stop waits for an
 adapter that holds its device's lock while it moves. The guard beside a run has a core of its own, which reaches the
-stage only if `configuration` can be loaded twice. Tried with stages written in Python; not with an adapter.
+stage only if `configuration` can be loaded twice. Tried with stages written in Python and with the stage of DemoCamera.
 """
 
 from __future__ import annotations

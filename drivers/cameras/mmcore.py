@@ -3,7 +3,7 @@
 Facts: the interface of MMCore. A snap returns when the light is collected, so the bench may move then; it runs in a
 thread, because it cannot be told to end. The core has one image for all its cameras: nothing else may snap meanwhile.
 There are no time stamps and no numbers of frames. Gain, black level and triggers have no common unit or name there:
-they are `properties`. Tried with a camera written in Python; not with an adapter.
+they are `properties`. Tried with a camera written in Python and with DemoCamera.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class LoopbackAddress:
             return
         addresses = loopback_addresses()
         # Linux binds any 127.x.x.x, but a driver that looks for cameras asks at the addresses of interfaces.
-        if addresses and self.address not in addresses:
+        if self.address.startswith("127.") and addresses and self.address not in addresses:
             raise self._error("no network interface has that address", f"Add it: ip addr add {self.address}/8 dev lo")
         # Real time: whoever holds the address may be another program.
         deadline_s = time.monotonic() + wait_s
