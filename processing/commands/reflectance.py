@@ -68,23 +68,24 @@ def fit_material_command(
     geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
     out: Annotated[Path, typer.Option(help="Material file (YAML) to write.")],
     name: Annotated[str, typer.Option(help="Name of the material.")] = "fitted material",
+    kind: Annotated[str, typer.Option(help="Model: polarized_diffuse or rough_plastic.")] = "polarized_diffuse",
     correlation: Annotated[bool, typer.Option("--correlation", help="Maximum linear correlation.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file of that name.")] = False,
 ) -> None:
     """Fit n + i k, a and b: to the dominant process of Mueller images, to other images by maximum linear correlation.
 
     --correlation takes the second for Mueller images too: it is more precise, and wrong where small eigenvalues differ.
+    --kind rough_plastic fits n, alpha and albedo of a rough surface over a volume that depolarizes.
     """
     from processing.doors import require_place
-    from processing.reflectance.material_fit import NAMES
     from processing.steps.material import MaterialFitting
 
     require_place(out, overwrite)
-    found = MaterialFitting(tuple(sources), geometry, name, correlation).fitted()
+    found = MaterialFitting(tuple(sources), geometry, name, correlation, kind).fitted()
     fit = found.fit
     if found.simulated:
         typer.echo("SIMULATED data")
-    for key, value, stderr in zip(NAMES, fit.constants, fit.stderr, strict=True):
+    for key, value, stderr in zip(fit.names, fit.constants, fit.stderr, strict=True):
         known = "" if fit.identified[key] else "   NOT IDENTIFIED by these data"
         typer.echo(f"  {key} = {value:.5g} +- {stderr:.2g}{known}")
     typer.echo(f"  method: {fit.method}; condition number {fit.condition:.3g}, {fit.pixels} pixels")

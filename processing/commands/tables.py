@@ -111,7 +111,9 @@ def compare_command(
 
 
 def export_command(
-    tables: Annotated[list[Path], typer.Argument(help="Mueller tables in the renderer layout, one a wavelength.")],
+    tables: Annotated[
+        list[Path], typer.Argument(help="Mueller tables in the renderer layout, one a wavelength, or a material file.")
+    ],
     out: Annotated[Path, typer.Option(help="Renderer file (.pbsdf) to write; about 1 GB.")],
     white_m00: Annotated[
         float, typer.Option(help="M00 of a perfect white surface at normal incidence, of a table without --white.")
@@ -119,16 +121,24 @@ def export_command(
     keep_gaps: Annotated[bool, typer.Option("--keep-gaps", help="Leave empty bins black.")] = False,
     uncertainty: Annotated[bool, typer.Option("--uncertainty", help="Add u of each element; another 1 GB.")] = False,
 ) -> None:
-    """Write tables as a Mitsuba .pbsdf."""
+    """Write tables, or a material of two processes, as a Mitsuba .pbsdf."""
     from processing.commands.progress_bar import progress_bar
-    from processing.reflectance.pbsdf import export
+    from processing.reflectance.base import load_reflectance
+    from processing.reflectance.pbsdf import export, model_table
     from processing.reflectance.tables import ScatteringTable
 
+    read = []
+    for path in tables:
+        if path.suffix not in (".yaml", ".yml"):
+            read.append(ScatteringTable.load(path))
+            continue
+        material = load_reflectance(path)
+        for nm in material.wavelengths_nm:
+            with progress_bar(f"{material.name}, {nm:g} nm", "angles") as tick:
+                read.append(model_table(material, nm, tick))
     with progress_bar("writing", "wavelengths") as tick:
         gaps: Literal["nearest", "nan"] = "nan" if keep_gaps else "nearest"
-        missing = export(
-            [ScatteringTable.load(p) for p in tables], out, white_m00, gaps, progress=tick, uncertainty=uncertainty
-        )
+        missing = export(read, out, white_m00, gaps, progress=tick, uncertainty=uncertainty)
     filled = "left black" if keep_gaps else "filled with the nearest bin"
     typer.echo(f"  visible bins without a sample: {100 * missing:.1f} %, {filled}")
     typer.echo(str(out))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from processing.maps.stokes_vector import moves_of_light
 from processing.reduction.sent_light import light_of, sent_parts, sent_rows
 from processing.reduction.systematic import Systematic
 from processing.reflectance.material_fit import MaterialFit, fit_values
+from processing.reflectance.plastic_fit import fit_plastic
 from processing.storage.products.images import SMALLEST, MuellerImage, StokesImage
 from processing.storage.products.product import Product
 
@@ -49,14 +51,19 @@ ALIKE = 1e-4
 
 
 def fit_products(
-    sources: Sequence[Path], geometry_file: Path, *, correlation: bool = False
+    sources: Sequence[Path], geometry_file: Path, *, correlation: bool = False, kind: str = "polarized_diffuse"
 ) -> tuple[MaterialFit, float, bool]:
-    """Fit Mueller or Stokes products, see `fit_values`: fit, wavelength, simulated.
+    """Fit Mueller or Stokes products, see `fit_values` and `fit_plastic`: fit, wavelength, simulated.
 
     Raises
     ------
-    ProcessError : products of several kinds or wavelengths, simulated and measured mixed, no arm angle.
+    ProcessError : a kind of model that is not fitted; products of several kinds or wavelengths, simulated and measured
+        mixed, no arm angle.
     """
+    if kind not in ("polarized_diffuse", "rough_plastic"):
+        raise ProcessError(f"--kind {kind}: constants of polarized_diffuse and of rough_plastic can be fitted.")
+    if correlation and kind != "polarized_diffuse":
+        raise ProcessError("--correlation belongs to polarized_diffuse. Leave it away.")
     require_distinct(sources)
     kinds, simulated, wavelengths = set(), set(), set()
     for source in sources:
@@ -90,13 +97,13 @@ def fit_products(
         (np.concatenate([data.moved[k][0] for data in each], axis=1), first.moved[k][1])
         for k in range(len(first.inputs))
     ]
-    fit = fit_values(
+    fit_of = fit_plastic if kind == "rough_plastic" else partial(fit_values, correlation=correlation)
+    fit = fit_of(
         _joined([data.points for data in each]),
         np.concatenate([data.values for data in each], axis=1),
         first.rows,
         np.concatenate([data.covariance for data in each]),
         max_pixels=sum(len(data.covariance) for data in each),
-        correlation=correlation,
         moved=moved,
     )
     return fit, float(wavelengths.pop()), simulated.pop()

@@ -1,5 +1,7 @@
 """Material constants n + i k, a, b of the polarized diffuse model from Mueller elements or Stokes vectors.
 
+Those of a sum of two processes are in `plastic_fit`.
+
 Two methods (paper, conclusion). Of whole Mueller matrices, weighted least squares on the dominant process: the
 distance of M/m00 from m0 depends on m0 by <M, m0> alone, for all Mueller-Jones matrices are of one length. That is
 linear in M, so noise does not bias it, and largest at the dominant process, however the small eigenvalues differ.
@@ -13,23 +15,54 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel
 
 from processing.arrays import Array, ComplexArray
 from processing.errors import NotDetermined
 from processing.geometry.frames import ScatteringGeometry
 from processing.polarization.mueller import coherency, coherency_to_mueller
 from processing.reflectance import fresnel, polarized_diffuse
-from processing.reflectance.base import normalized_mueller
+from processing.reflectance.base import kinds, normalized_mueller
 
-NAMES = ("n", "k", "a", "b")
-LOWER, UPPER = np.array([1.01, 0.0, 0.0, 0.3]), np.array([4.0, 4.0, 3.0, 8.0])
-#: Start values; the sum of squares has more than one minimum.
-STARTS = ((1.3, 0.1, 0.1, 2.0), (1.6, 0.02, 0.3, 1.5), (1.2, 0.4, 0.05, 3.0), (2.0, 1.0, 0.5, 2.0))
-#: A constant counts as identified when its standard error is below this part of it (k: or below 0.02).
-RELATIVE_LIMIT, K_LIMIT = 0.3, 0.02
+
+@dataclass(frozen=True)
+class Ranges:
+    """Constants of a kind of material, the refractive index first.
+
+    Attributes
+    ----------
+    starts : start values; the sum of squares has more than one minimum.
+    sizes : changes that matter about alike.
+    small : standard errors below which a constant that may well be 0 is identified.
+    """
+
+    names: tuple[str, ...]
+    lower: Array
+    upper: Array
+    starts: tuple[tuple[float, ...], ...]
+    sizes: tuple[float, ...]
+    small: tuple[float, ...]
+
+    def inside(self, values: Array) -> NDArray[np.bool_]:
+        """Which constants are not at the end of their range."""
+        near = NEAR * (self.upper - self.lower)
+        return np.asarray((values > self.lower + near) & (values < self.upper - near))
+
+
+DIFFUSE = Ranges(
+    names=("n", "k", "a", "b"),
+    lower=np.array([1.01, 0.0, 0.0, 0.3]),
+    upper=np.array([4.0, 4.0, 3.0, 8.0]),
+    starts=((1.3, 0.1, 0.1, 2.0), (1.6, 0.02, 0.3, 1.5), (1.2, 0.4, 0.05, 3.0), (2.0, 1.0, 0.5, 2.0)),
+    sizes=(0.1, 0.1, 0.1, 1.0),
+    small=(0.0, 0.02, 0.0, 0.0),
+)
+#: A constant counts as identified when its standard error is below this part of it.
+RELATIVE_LIMIT = 0.3
 #: Standard deviation of the small eigenvalues from their mean, of the sum of all four: 3 % apart, as of the paper's
 #: sphere at 662 nm, is 0.012.
 DEPARTURE = 0.012
@@ -48,19 +81,22 @@ class MaterialFit:
 
     Attributes
     ----------
-    constants : n, k, a, b.
-    covariance : (4, 4); NaN for a constant at its bound. From the scatter of whole pixels, of blocks of them where the
+    kind : of the reflectance model.
+    names, constants : n, k, a, b; or n, alpha, albedo.
+    covariance : (P, P); NaN for a constant at its bound. From the scatter of whole pixels, of blocks of them where the
         model does not describe the data; it holds noise and misfit, not errors of the geometry.
-    departure : (4, 4), covariance by small eigenvalues that differ; zero where they do not matter.
-    systematic : (4, 4), covariance by the instrument's uncertainty; zero where none is stated.
+    departure : (P, P), covariance by small eigenvalues that differ; zero where they do not matter.
+    systematic : (P, P), covariance by the instrument's uncertainty; zero where none is stated.
     identified : which constants the data fix at all; an unidentified one may be anything.
     correlation : mean linear correlation between data and model; NaN for the dominant process.
     residual : root mean square of the residual over that of the data's polarized part; NaN likewise.
     chi_square : what neither the model nor the instrument's uncertainty describes, over the noise; 1: noise alone.
     describes : whether noise makes such a chi-square.
-    method : "dominant process" or "linear correlation".
+    method : "dominant process", "linear correlation" or "sum of two processes".
     """
 
+    kind: str
+    names: tuple[str, ...]
     constants: Array
     covariance: Array
     departure: Array
@@ -76,17 +112,17 @@ class MaterialFit:
 
     @property
     def stderr(self) -> Array:
-        """(4,), standard errors."""
+        """(P,), standard errors."""
         return np.asarray(np.sqrt(np.diag(self.covariance + self.departure + self.systematic)))
 
     def notes(self, sources: Sequence[str]) -> list[str]:
         """Lines for the material file: where the constants come from, their errors and correlations."""
-        errors = ", ".join(f"{name} {error:.2g}" for name, error in zip(NAMES, self.stderr, strict=True))
+        errors = ", ".join(f"{name} {error:.2g}" for name, error in zip(self.names, self.stderr, strict=True))
         with np.errstate(divide="ignore", invalid="ignore"):
             correlation = self.covariance / np.outer(self.stderr, self.stderr)
-        pairs = [(i, j) for i in range(4) for j in range(i + 1, 4) if np.isfinite(correlation[i, j])]
-        between = ", ".join(f"{NAMES[i]} {NAMES[j]} {correlation[i, j]:+.2f}" for i, j in pairs)
-        lost = ", ".join(name for name in NAMES if not self.identified[name])
+        pairs = [pair for pair in combinations(range(len(self.names)), 2) if np.isfinite(correlation[pair])]
+        between = ", ".join(f"{self.names[i]} {self.names[j]} {correlation[i, j]:+.2f}" for i, j in pairs)
+        lost = ", ".join(name for name in self.names if not self.identified[name])
         return [
             f"fitted to {', '.join(sources)} by the {self.method}",
             f"{self.pixels} pixels, condition number {self.condition:.3g}",
@@ -104,15 +140,15 @@ class MaterialFit:
         apart = f"small eigenvalues {250 * DEPARTURE:.0f} % apart, which a Mueller image does not have"
         for what, part in ((apart, self.departure), ("the instrument's uncertainty", self.systematic)):
             if part.any():
-                by = ", ".join(f"{n} {e:.2g}" for n, e in zip(NAMES, np.sqrt(np.diag(part)), strict=True))
+                by = ", ".join(f"{n} {e:.2g}" for n, e in zip(self.names, np.sqrt(np.diag(part)), strict=True))
                 out.append(f"of these, {what}: {by}")
         return out
 
-    def model(self, name: str, wavelength_nm: float) -> polarized_diffuse.Model:
+    def model(self, name: str, wavelength_nm: float) -> BaseModel:
         """The fitted reflectance model."""
-        n, k, a, b = (float(v) for v in self.constants)
-        constants = {wavelength_nm: polarized_diffuse.Constants(n=n, k=k, a=a, b=b)}
-        return polarized_diffuse.Model(name=name, source="process fit-material", constants=constants)
+        constants = {wavelength_nm: dict(zip(self.names, map(float, self.constants), strict=True))}
+        given = {"kind": self.kind, "name": name, "source": "process fit-material", "constants": constants}
+        return kinds()[self.kind].model_validate(given)
 
 
 def fit_values(
@@ -142,7 +178,7 @@ def fit_values(
     NotDetermined : fewer than 10 pixels are finite.
     """
     x, c, r = (np.asarray(a, dtype=float) for a in (values, covariance, rows))
-    keep = _some(np.isfinite(x).all(axis=0) & np.isfinite(c).all(axis=(1, 2)), max_pixels)
+    keep = evenly(np.isfinite(x).all(axis=0) & np.isfinite(c).all(axis=(1, 2)), max_pixels)
     # The ridge is for values without noise.
     c = c[keep] + 1e-9 * np.trace(c[keep], axis1=1, axis2=2)[:, None, None] * np.eye(len(x))
     model = _Forward(geometry[keep])
@@ -171,8 +207,8 @@ def _fit_dominant(model: _Forward, data: Array, covariance: Array, moved: Sequen
     def unlike(q: Array) -> float:
         return -float(np.sum(scaled * model.mueller(q).reshape(-1, 16)))
 
-    bounds = list(zip(LOWER.tolist(), UPPER.tolist(), strict=True))
-    fits = [minimize(unlike, np.array(s), method="L-BFGS-B", bounds=bounds, tol=1e-13) for s in STARTS]
+    bounds = list(zip(DIFFUSE.lower.tolist(), DIFFUSE.upper.tolist(), strict=True))
+    fits = [minimize(unlike, np.array(s), method="L-BFGS-B", bounds=bounds, tol=1e-13) for s in DIFFUSE.starts]
     # The search ends where its sum stops changing; the root of its slope is sharper.
     found = _root(model, np.asarray(min(fits, key=lambda fit: float(fit.fun)).x), scaled)
     off = np.array([_root(model, found, other * weight) - found for other in moved]).reshape(-1, 4)
@@ -181,9 +217,9 @@ def _fit_dominant(model: _Forward, data: Array, covariance: Array, moved: Sequen
     noise = np.einsum("nki,nij,nlj->nkl", parts, covariance, parts, optimize=True)
     whiten = np.linalg.inv(np.linalg.cholesky(noise)) @ parts
     seen, *changes = (np.einsum("nki,ni->nk", whiten, values) for values in (data, *moved))
-    square = _unexplained(seen, [change - seen for change in changes])
+    square = unexplained(seen, [change - seen for change in changes])
     free = 6 * len(data) - 4
-    return _result(found, -curvature.sum(axis=0), scores, square, free=free, method="dominant process", off=off)
+    return result_of(found, -curvature.sum(axis=0), scores, square, free=free, method="dominant process", off=off)
 
 
 def _root(model: _Forward, start: Array, scaled: Array) -> Array:
@@ -191,14 +227,14 @@ def _root(model: _Forward, start: Array, scaled: Array) -> Array:
     found = start.copy()
     for _ in range(2):
         slope, curvature = (np.sum(part, axis=0) for part in _slopes(model, found, scaled))
-        inside = (found > LOWER + NEAR * (UPPER - LOWER)) & (found < UPPER - NEAR * (UPPER - LOWER))
+        inside = DIFFUSE.inside(found)
         if inside.any():
             step = np.linalg.lstsq(curvature[np.ix_(inside, inside)], slope[inside], rcond=1e-10)[0]
-            found[inside] = np.clip(found[inside] - step, LOWER[inside], UPPER[inside])
+            found[inside] = np.clip(found[inside] - step, DIFFUSE.lower[inside], DIFFUSE.upper[inside])
     return found
 
 
-def _unexplained(residual: Array, changes: Sequence[Array]) -> float:
+def unexplained(residual: Array, changes: Sequence[Array]) -> float:
     """Sum of squares of a residual in units of the noise, where each of `changes` may be in it, of unit variance."""
     square = float(np.sum(residual**2))
     if not changes:
@@ -300,8 +336,8 @@ class _Correlation:
 
 def _fit_correlation(own: _Correlation, moved: Sequence[_Correlation]) -> MaterialFit:
     """Fit by linear correlation; `moved` are the same data by an instrument that is off."""
-    found, jacobian = _search(own.residual, STARTS)
-    off = np.array([_search(other.residual, (found,))[0] - found for other in moved]).reshape(-1, 4)
+    found, jacobian = search(own.residual, DIFFUSE)
+    off = np.array([search(other.residual, DIFFUSE, found)[0] - found for other in moved]).reshape(-1, 4)
     left = own.residual(found)
     changes = [other.residual(found) - left for other in moved]
     modelled, overlap = own.parts(found)
@@ -315,12 +351,12 @@ def _fit_correlation(own: _Correlation, moved: Sequence[_Correlation]) -> Materi
         extra -= unit * np.sum(unit * extra, axis=1, keepdims=True)
         departures.append(np.einsum("nkp,nk->p", slopes, extra))
         unlike += float(np.sum(extra**2))
-    square, free = _unexplained(left, changes), left.size - 2 * len(left) - 4
+    square, free = unexplained(left, changes), left.size - 2 * len(left) - 4
     # Eigenvalues may differ by more than usual: by as much as makes the residual.
     more = max(1.0, float(np.sqrt(max(square - free, 0) / unlike)))
     scores, curvature = np.einsum("nkp,nk->np", slopes, left), jacobian.T @ jacobian
     method, apart = "linear correlation", more * np.array(departures)
-    result = _result(found, curvature, scores, square, free=free, method=method, off=off, departures=apart)
+    result = result_of(found, curvature, scores, square, free=free, method=method, off=off, departures=apart)
     share = float(np.sqrt(np.sum(left**2) / np.sum(own.data**2)))
     return replace(result, residual=share, correlation=float(np.nanmean(rho)))
 
@@ -340,14 +376,16 @@ class _Forward:
         return normalized_mueller(jones + (a * self.sine**b)[:, None, None] * self.diffuse)
 
 
-def _some(good: NDArray[np.bool_], limit: int) -> NDArray[np.int64]:
+def evenly(good: NDArray[np.bool_], limit: int) -> NDArray[np.int64]:
+    """Indices of at most `limit` good pixels, evenly spread. Raises NotDetermined where fewer than 10 are."""
     index = np.flatnonzero(good)
     if index.size < 10:
         raise NotDetermined(f"only {index.size} pixels are finite; a material fit needs 10 and more. Check the mask.")
     return index[np.linspace(0, index.size - 1, min(index.size, limit)).astype(np.int64)]
 
 
-def _search(residual: Callable[[Array], Array], starts: Sequence[Array | tuple[float, ...]]) -> tuple[Array, Array]:
+def search(residual: Callable[[Array], Array], of: Ranges, near: Array | None = None) -> tuple[Array, Array]:
+    """Constants of least squares and the derivatives (N, P) there: from `near`, or from all starts."""
     # Every module of this folder is imported when a material file is read, the optimizer only where it is needed.
     from scipy.optimize import least_squares
 
@@ -355,8 +393,8 @@ def _search(residual: Callable[[Array], Array], starts: Sequence[Array | tuple[f
         return residual(p).reshape(-1)
 
     best = None
-    for start in starts:
-        fit = least_squares(flat, start, bounds=(LOWER, UPPER), x_scale=[0.1, 0.1, 0.1, 1.0], max_nfev=60)
+    for start in of.starts if near is None else (near,):
+        fit = least_squares(flat, start, bounds=(of.lower, of.upper), x_scale=of.sizes, max_nfev=60)
         if best is None or fit.cost < best.cost * (1 - 1e-9):
             best = fit
     if best is None:
@@ -364,7 +402,7 @@ def _search(residual: Callable[[Array], Array], starts: Sequence[Array | tuple[f
     return np.asarray(best.x), np.asarray(best.jac)
 
 
-def _result(
+def result_of(
     found: Array,
     curvature: Array,
     scores: Array,
@@ -374,16 +412,17 @@ def _result(
     method: str,
     off: Array,
     departures: Array | None = None,
+    kind: str = "polarized_diffuse",
+    of: Ranges = DIFFUSE,
 ) -> MaterialFit:
-    """A fit from the curvature (4, 4) of its sum and the slopes (N, 4) of the pixels.
+    """A fit from the curvature (P, P) of its sum and the slopes (N, P) of the pixels.
 
-    `square`, of `free` numbers, is what it does not describe in units of the noise; `off` (D, 4) is what each
+    `square`, of `free` numbers, is what it does not describe in units of the noise; `off` (D, P) is what each
     uncertain input of the instrument does to the constants, `departures` are slopes by what the model leaves out.
     """
     from scipy.special import chdtrc
 
-    pixels, width = len(scores), UPPER - LOWER
-    inside = (found > LOWER + NEAR * width) & (found < UPPER - NEAR * width)
+    pixels, width, inside = len(scores), of.upper - of.lower, of.inside(found)
     size = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
     values = np.linalg.eigvalsh((curvature / np.outer(size, size))[np.ix_(inside, inside)])
     condition = float(np.sqrt(values[-1] / max(values[0], 1e-300))) if inside.any() else np.inf
@@ -391,7 +430,7 @@ def _result(
     if not describes:
         block = np.arange(len(scores)) * BLOCKS // len(scores)
         scores = np.stack([scores[block == k].sum(axis=0) for k in range(BLOCKS)])
-    covariance, departure = np.full((4, 4), np.nan), np.zeros((4, 4))
+    covariance, departure = np.full_like(curvature, np.nan), np.zeros_like(curvature)
     if inside.any() and condition < 1e7:
         # A constant at its bound is not known there: without its share the others would look sure.
         bread = np.linalg.inv(curvature + np.diag(np.where(inside, 0.0, 1 / width**2)))
@@ -402,11 +441,12 @@ def _result(
             departure = bread @ departures.T @ departures @ bread
     systematic = off.T @ off
     stderr = np.sqrt(np.diag(covariance + departure + systematic))
-    limit = RELATIVE_LIMIT * np.abs(found)
-    limit[1] = max(limit[1], K_LIMIT)
+    limit = np.maximum(RELATIVE_LIMIT * np.abs(found), of.small)
     # k and a may well be 0; an n at the end of its range is no surface, and what was fitted beside it means nothing.
-    identified = {name: bool(s <= m and inside[0]) for name, s, m in zip(NAMES, stderr, limit, strict=True)}
+    identified = {name: bool(s <= m and inside[0]) for name, s, m in zip(of.names, stderr, limit, strict=True)}
     return MaterialFit(
+        kind=kind,
+        names=of.names,
         constants=found,
         covariance=covariance,
         departure=departure,

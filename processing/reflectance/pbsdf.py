@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from processing.arrays import Array
-from processing.geometry.rusinkiewicz import Angles
+from processing.geometry.frames import ScatteringGeometry
+from processing.geometry.rusinkiewicz import Angles, directions
+from processing.reflectance.base import ReflectanceModel
 from processing.reflectance.table_axes import SHAPE, TableAxes
 from processing.reflectance.tables import ScatteringTable, TableError
 from processing.storage.formats.tensor_file import create_tensor_file, read_tensor_file
@@ -144,6 +146,33 @@ def load(path: Path | str, white_m00: float = 1.0, only_nm: float | None = None)
         table.add(Angles(*(a[..., :-1][seen] for a in angles)), values[:, seen])
         tables[int(wavelength)] = table
     return tables
+
+
+def model_table(
+    model: ReflectanceModel, wavelength_nm: float, progress: Callable[[int, int], None] | None = None
+) -> ScatteringTable:
+    """Table in 1/sr, in renderer frames and layout, of a model that has a BRDF.
+
+    Raises
+    ------
+    TableError : the model describes the dominant process alone, as all but `rough_plastic` do.
+    """
+    if not hasattr(model, "brdf"):
+        raise TableError("this kind of material has no brightness, only a dominant process. Give a rough_plastic.")
+    axes = TableAxes("renderer")
+    table = ScatteringTable(MUELLER, wavelength_nm, "renderer", frames="renderer", scale_u=np.nan)
+    theta_h, *others = (np.deg2rad(a) for a in (axes.theta_h_deg, axes.theta_d_deg, axes.phi_d_deg[:-1]))
+    parts = np.split(theta_h, np.arange(13, len(theta_h), 13))
+    for k, part in enumerate(parts):
+        angles = Angles(*(a.reshape(-1) for a in np.meshgrid(part, *others, indexing="ij")))
+        # y is the axis s of both beams, also where source and camera coincide.
+        points = ScatteringGeometry(*directions(*angles), up=np.array([1.0, 0.0, 0.0]))
+        values = model.brdf(points, wavelength_nm).reshape(-1, 16).T
+        seen = values[0] > 0
+        table.add(Angles(*(a[seen] for a in angles)), values[:, seen])
+        if progress:
+            progress(k + 1, len(parts))
+    return table
 
 
 def _check(table: ScatteringTable, white_m00: float, uncertainty: bool) -> None:

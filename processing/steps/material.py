@@ -36,7 +36,7 @@ class FittedMaterial:
 
 @dataclass(frozen=True)
 class MaterialFitting(OfFiles):
-    """`process fit-material`: n + i k, a and b of the polarized diffuse model.
+    """`process fit-material`: constants of the polarized diffuse model, or of a rough plastic.
 
     Attributes
     ----------
@@ -48,6 +48,8 @@ class MaterialFitting(OfFiles):
         Of the material, for its file.
     correlation
         See `processing.reflectance.material_fit.fit_values`.
+    kind
+        Of the model: polarized_diffuse or rough_plastic.
 
     Examples
     --------
@@ -62,14 +64,17 @@ class MaterialFitting(OfFiles):
     geometry: Path
     name: str = "fitted material"
     correlation: bool = False
+    kind: str = "polarized_diffuse"
 
     def record(self) -> Step:
         """Name, sources and geometry."""
         inputs = [file_identity(source, "source") for source in self.sources]
         options = {"name": self.name} | ({"correlation": True} if self.correlation else {})
+        if self.kind != "polarized_diffuse":
+            options["kind"] = self.kind
         return Step("fit-material", options, (*inputs, *geometry_identities(self.geometry)))
 
     def fitted(self) -> FittedMaterial:
         """Fit, see `processing.maps.material_fit.fit_products`."""
-        fit, wavelength_nm, simulated = fit_products(self.sources, self.geometry, correlation=self.correlation)
-        return FittedMaterial(fit, wavelength_nm, simulated, self.name, self.record())
+        found = fit_products(self.sources, self.geometry, correlation=self.correlation, kind=self.kind)
+        return FittedMaterial(*found, self.name, self.record())

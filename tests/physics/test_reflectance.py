@@ -72,8 +72,12 @@ class TestPolarizedDiffuse(ReflectanceConformance):
     material = "{kind: polarized_diffuse, name: test, constants: {662: {n: 1.3, k: 0.08, a: 0.17, b: 2.0}}}"
 
 
+class TestRoughPlastic(ReflectanceConformance):
+    material = "{kind: rough_plastic, name: test, constants: {662: {n: 1.5, alpha: 0.3, albedo: 0.2}}}"
+
+
 def test_every_model_passes_the_conformance_kit():
-    materials = (TestFirstSurface.material, TestPolarizedDiffuse.material)
+    materials = (TestFirstSurface.material, TestPolarizedDiffuse.material, TestRoughPlastic.material)
     assert {material.split(",")[0].removeprefix("{kind: ") for material in materials} == set(kinds())
 
 

@@ -14,9 +14,10 @@ from processing.maps.material_fit import covariance_by_light, determined_values
 from processing.polarization.cloude import xi0_and_dominant
 from processing.polarization.mueller import coherency, coherency_to_mueller
 from processing.reduction.sent_light import sent_rows
-from processing.reflectance.material_fit import NAMES, MaterialFit, fit_values
+from processing.reflectance.material_fit import DIFFUSE, MaterialFit, fit_values
 from simulators.bench.scene import Scene
 
+NAMES = DIFFUSE.names
 TRUE = np.array([1.3, 0.08, 0.17, 2.0])
 VERTICAL = np.array([1.0, -1, 0, 0]) / 2
 
