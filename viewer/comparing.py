@@ -18,7 +18,7 @@ from processing.reduction.systematic import INPUTS, Systematic
 from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
 from processing.storage.captures.capture import Capture
 from processing.storage.products.images import MuellerImage, difference_errors, element_gradient
-from processing.storage.products.product import LIT_ERRORS, Product, is_product
+from processing.storage.products.product import Product, is_lit, is_product
 from processing.storage.products.provenance import content_of
 from viewer.frames import chosen
 from viewer.pages import file_of, pages_of
@@ -143,7 +143,7 @@ def product_values(product: Product, query: Any, window: Window) -> Measured:
     if _is_derived(product, query):
         image = _image(product, window)
         values, gradient, *_ = _derived(image, name)
-        lit = image.values[0, 0] > LIT_ERRORS * np.nan_to_num(image.errors[0, 0])
+        lit = is_lit(image.values[0, 0], image.errors[0, 0])
         shown = (np.where(lit, values, np.nan), np.sqrt(image.variance_of(gradient)))
         return shown[0].reshape(window.shape).astype(np.float32), shown[1].reshape(window.shape).astype(np.float32)
     if name == "mueller":
@@ -152,7 +152,7 @@ def product_values(product: Product, query: Any, window: Window) -> Measured:
             for dataset in ("mueller", "mueller_errors")
         )
         with np.errstate(divide="ignore", invalid="ignore"):
-            m00 = np.where(elements[0] > LIT_ERRORS * np.nan_to_num(errors[0]), elements[0], np.nan)
+            m00 = np.where(is_lit(elements[0], errors[0]), elements[0], np.nan)
             return (elements[0], errors[0]) if index == 0 else (elements[index] / m00, errors[index] / m00)
     values = read_map(product, name, index, window)
     if f"{name}_errors" not in product.names:

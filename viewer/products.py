@@ -13,8 +13,8 @@ from processing.errors import ProcessError
 from processing.maps.stokes_vector import is_stokes_vector
 from processing.polarization import gradients
 from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
-from processing.reports.fact_words import fact_words
-from processing.storage.products.product import COMPANIONS, LIT_ERRORS, Product
+from processing.reports.fact_words import fact_lines
+from processing.storage.products.product import COMPANIONS, Product, is_lit
 from processing.storage.products.provenance import steps_text
 from viewer.frames import others
 from viewer.library import made_from, made_into
@@ -42,7 +42,7 @@ def product(request: Request) -> HTMLResponse:
     entry, entries = library.entry(library.name(path)), library.entries()
     with Product(path) as opened:
         maps, choices = maps_of(opened), choices_of(opened)
-        facts = [(name.replace("_", " "), fact_words(v)) for name, v in opened.facts.items() if name != "warnings"]
+        facts = [line for name, line in fact_lines(opened.facts).items() if name != "warnings"]
         provenance = steps_text(opened.steps)
         shape, kind = opened.shape, opened.kind
         matrices = kind in MATRICES and not is_stokes_vector(opened)
@@ -182,7 +182,7 @@ def read_mueller(opened: Product, window: Window, normalized: bool, errors: bool
     stderr = window.every(opened.get("mueller_errors", window.rows)).reshape(16, *window.shape)
     m00 = elements[0].copy()
     with np.errstate(invalid="ignore", divide="ignore"):
-        lit = m00 > LIT_ERRORS * np.nan_to_num(stderr[0])
+        lit = is_lit(m00, stderr[0])
         shown = np.asarray(stderr if errors else elements, dtype=np.float32)
         if normalized:
             shown = shown / m00

@@ -24,7 +24,7 @@ from processing.reflectance.tables import ScatteringTable
 from processing.reports.figure_style import CYCLIC, entitle, grid_figure, percentile
 from processing.reports.reflectance_figures import STYLES, tables_figure
 from processing.storage.products.images import MuellerImage
-from processing.storage.products.product import LIT_ERRORS, Product
+from processing.storage.products.product import Product, is_lit
 
 Panels = list[tuple[str, NDArray[Any], dict[str, Any]]]
 FRAMES = "Instrument frames; rows and columns of tiles are those of the matrix."
@@ -80,7 +80,7 @@ def dominant(product: Path, geometry: Path, material: Path) -> Dominant:
     header = image.header
     view = ViewingGeometry.load(geometry).at(float(header.omega_deg or 0), *image.mask.shape)
     model = load_reflectance(material).mueller_jones(view.points, header.wavelength_nm)
-    lit = image.values[0, 0] > LIT_ERRORS * np.nan_to_num(image.errors[0, 0])
+    lit = is_lit(image.values[0, 0], image.errors[0, 0])
     measured = np.where(lit[..., None, None], xi0_and_dominant(image.matrices.astype(float))[1], np.nan)
     measured[~view.mask] = np.nan
     return Dominant(measured, view.fill(np.asarray(model, dtype=float)), view.mask)

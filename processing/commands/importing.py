@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from processing.commands.batch import Made, files_of, run_batch
 from processing.commands.purposes import DATA
 from processing.commands.recipe import keep_recipe, read_recipe
+
+if TYPE_CHECKING:
+    from processing.steps.file_step import Progress
 
 
 class AngleUnit(StrEnum):
@@ -57,6 +60,7 @@ def import_command(
     sample: Annotated[
         str, typer.Option(help="air, mirror, unknown, or a file with 16 numbers (row-major).")
     ] = "unknown",
+    repeats: Annotated[int, typer.Option(min=1, help="Frames of each state, one after the other.")] = 1,
     omega_deg: Annotated[float | None, typer.Option(help="Angle of the source arm.")] = None,
     black_level: Annotated[float, typer.Option(help="Pedestal in counts.")] = 0.0,
     gain_e_per_count: Annotated[
@@ -70,6 +74,9 @@ def import_command(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the states as understood, draw the frames, write no capture.")
     ] = False,
+    each: Annotated[
+        bool | None, typer.Option("--each", help="Each frame is a scene of its own: a capture for each; --out: folder.")
+    ] = None,
     recipe: Annotated[
         Path | None,
         typer.Option(
@@ -85,9 +92,10 @@ def import_command(
     """
     from processing.commands.loaded_late.import_preview import show_understood
     from processing.commands.progress_bar import progress_bar
+    from processing.storage.captures.capture import Capture
     from processing.storage.captures.schema import Detector
     from processing.storage.formats.foreign_arrays import ImportFailed
-    from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
+    from processing.storage.formats.importing import ImportRequest, import_capture, read_sample, scenes_of
 
     if gain_e_per_count is not None and gain_e_per_count <= 0:
         raise ImportFailed(f"--gain-e-per-count {gain_e_per_count:g}: must be above 0")
@@ -111,14 +119,33 @@ def import_command(
         columns=named,
         angles=angles.value if angles else None,
         darks=darks,
+        repeats=repeats,
     )
+    scenes = scenes_of(request, out) if each else [request]
     if dry_run:
-        show_understood(request)
+        show_understood(scenes[0])
+        return
+    if each:
+        by_file = {Path(str(scene.stack)): scene for scene in scenes}
+
+        def make(frame: Path, tick: Progress) -> Made:
+            scene = by_file[frame]
+            is_newer = scene.out.exists() and scene.out.stat().st_mtime > frame.stat().st_mtime
+            if overwrite or not is_newer:
+                import_capture(scene, tick)
+            return Made((scene.out,), is_newer and not overwrite)
+
+        typer.echo(f"recipe: {keep_recipe(context, scenes[0].out.parent / 'each.h5')}")
+        run_batch("importing", "states", list(by_file), make)
         return
     with progress_bar("importing", "states") as tick:
         header = import_capture(request, tick)
     recipe_file = keep_recipe(context, request.out)
     typer.echo(f"{request.out}: {header.title}, {header.wavelength_nm:g} nm, sample {header.sample.kind}")
+    with Capture(request.out) as capture:
+        count = 0 if capture.angles_deg else capture.states_with("sample").size
+    if count > 1:
+        typer.echo(f"{count} frames in which nothing turns: `reduce` averages them. If each is a scene, add --each")
     typer.echo(f"recipe: {recipe_file}")
 
 

@@ -30,6 +30,8 @@ class ImportRecipe(BaseModel):
     gain_e_per_count: float | None = None
     read_noise_e: float | None = None
     bits: int | None = None
+    repeats: int | None = None
+    each: bool | None = None
 
 
 def read_recipe(context: typer.Context, path: Path | None) -> Path | None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from processing.reports.fact_words import fact_words
+from processing.reports.fact_words import fact_lines, fact_words
 
 #: Endings of the names of facts that are standard errors of other facts.
 ERRORS = ("_error", "_stderr")
@@ -21,9 +21,9 @@ def summary(product: Path) -> None:
         facts, simulated = opened.facts, opened.simulated
     if simulated:
         typer.echo("SIMULATED data")
-    for name, value in facts.items():
+    for name, (label, words) in fact_lines(facts).items():
         if name not in ("warnings", "masked") and not name.endswith(ERRORS):
-            typer.echo(f"  {name.replace('_', ' ')}: {fact_words(value)}{_with_error(name, facts)}")
+            typer.echo(f"  {label}: {words}{_with_error(name, facts)}")
     print_warnings(product)
     typer.echo(str(product))
 

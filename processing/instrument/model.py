@@ -97,7 +97,7 @@ class InstrumentModel(Part):
         description="detector channels, each with the elements that its light alone passes",
     )
     measured: MeasuredMatrix | None = Field(
-        default=None, description="W that was measured as a whole, instead of elements"
+        default=None, description="W that was measured as a whole, instead of generator and analyzer"
     )
     mosaic: tuple[tuple[str, ...], ...] | None = Field(
         default=None, description="names of the channels over the super-pixel of a polarization camera"
@@ -128,6 +128,8 @@ class InstrumentModel(Part):
     def _take_uncertainties(cls, data: Any) -> Any:
         if not isinstance(data, Mapping):
             return data
+        if data.get("measured") is not None:
+            data = {"generator": (), "analyzer": ()} | dict(data)
         found: dict[str, Any] = {}
         plain = {key: without_u(node, found) if key in TRAINS else node for key, node in data.items()}
         given = plain.get("stderr") or {}

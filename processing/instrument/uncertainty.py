@@ -34,6 +34,9 @@ def value_directions(model: InstrumentModel) -> Iterator[ValueDirection]:
     fitted = model.calibrate if model.systematic else ()
     stated = {name: number(u) for name, u in model.stderr.items() if number(u) > 0 and name not in fitted}
     together = [[name for name in c.between if name in stated] for c in model.correlations]
+    if model.measured is not None:
+        for measured in model.measured.errors():
+            yield ValueDirection("measured W", model.measured.u, model.model_copy(update={"measured": measured}))
     for name, u in stated.items():
         if not any(name in group for group in together):
             yield ValueDirection(name, u, _moved(model, {name: u}))

@@ -17,7 +17,7 @@ from processing.maps.intervals import set_angles, set_ellipticity, set_magnitude
 from processing.polarization import gradients
 from processing.polarization.quantities import POLARIZATIONS, NamedStokes
 from processing.storage.products.images import MuellerImage
-from processing.storage.products.product import LIT_ERRORS, ProductWriter
+from processing.storage.products.product import ProductWriter, is_lit
 
 Pairs = Mapping[str, tuple[NamedStokes, NamedStokes]]
 
@@ -71,7 +71,7 @@ def partial_block(
             moved = set_systematic(found, {name: derived[name] for name in names}, moves)
             if by_input is not None:
                 by_input |= moved
-    found["lit"] = (image.values[0, 0] > LIT_ERRORS * np.nan_to_num(image.errors[0, 0])).astype(np.uint8)
+    found["lit"] = is_lit(image.values[0, 0], image.errors[0, 0]).astype(np.uint8)
     return found
 
 

@@ -43,7 +43,7 @@ from processing.polarization.scalar_files import scalar_quantities
 from processing.reduction.mueller import Progress
 from processing.reduction.systematic import INPUTS, Systematic
 from processing.storage.products.images import MuellerImage, require_all_elements, seen_elements
-from processing.storage.products.product import LIT_ERRORS, Plane, Product, ProductError, ProductWriter, Step
+from processing.storage.products.product import LIT_ERRORS, Plane, Product, ProductError, ProductWriter, Step, is_lit
 
 #: Pixels of a block: gradients take 128 bytes a pixel and quantity.
 BLOCK_PIXELS = 1 << 14
@@ -204,7 +204,7 @@ def quantities_block(
     """
     m = image.matrices.astype(float)
     # Where there is no light an eigenvalue solver only works on noise, slowly.
-    lit = np.where((image.values[0, 0] > LIT_ERRORS * np.nan_to_num(image.errors[0, 0]))[..., None, None], m, np.nan)
+    lit = np.where(is_lit(image.values[0, 0], image.errors[0, 0])[..., None, None], m, np.nan)
     derived: dict[str, Derived] = {}
     with np.errstate(divide="ignore", invalid="ignore"):
         for group in _GROUPS:

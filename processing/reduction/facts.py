@@ -13,7 +13,7 @@ from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.inversion import Inversion
 from processing.storage.captures.capture import CaptureError
 from processing.storage.products.pixel_mask import Mask
-from processing.storage.products.product import LIT_ERRORS, ProductWriter
+from processing.storage.products.product import ProductWriter, is_lit
 
 #: Above this median, the model and not the noise makes the residual (the median of a good one is within 0.1 of 1).
 SUSPICIOUS_CHI_SQUARE = 1.5
@@ -51,7 +51,7 @@ def mueller_facts(
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = residual / signal
         errors, m00 = product.get("mueller_errors", some), elements[0, 0]
-        lit = m00 > LIT_ERRORS * np.nan_to_num(errors[0, 0])
+        lit = is_lit(m00, errors[0, 0])
         each = (errors.reshape(16, *m00.shape)[1:] / m00)[:, lit]
     facts: dict[str, Any] = {
         "states": states,

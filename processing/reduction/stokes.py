@@ -31,7 +31,7 @@ from processing.reduction.sample_states import sample_states
 from processing.reduction.systematic import Systematic
 from processing.storage.captures.capture import Capture, CaptureError
 from processing.storage.products.pixel_mask import Mask
-from processing.storage.products.product import LIT_ERRORS, Plane, ProductWriter, Step
+from processing.storage.products.product import Plane, ProductWriter, Step, is_lit
 
 #: The method that docs/mosaic.md found best.
 DEFAULT_METHOD = "oriented"
@@ -309,7 +309,7 @@ def _facts(
     if good[::3, ::3].sum() > 1000:
         some[:] = False
         some[::3, ::3] = good[::3, ::3]
-    lit = some & (found["s0"] > LIT_ERRORS * found["s0_errors"])
+    lit = some & is_lit(found["s0"], found["s0_errors"])
     closure = found["closure"][lit] / found["s0"][lit]
     return {
         "states": states,
@@ -323,7 +323,7 @@ def _facts(
         "median_dolp": _median(found["dolp"][lit]),
         "median_dolp_error": _median(found["dolp_errors"][lit]),
         "pixels": mask.size,
-        "pixels_with_light": int(np.sum(found["s0"] > LIT_ERRORS * found["s0_errors"])),
+        "pixels_with_light": int(np.sum(is_lit(found["s0"], found["s0_errors"]))),
         "masked": counts,
         "warnings": warnings,
     }

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 #: Most inputs that a line names.
 MOST_NAMED = 4
+#: What an instrument determines that measures the light alone: the first column of M is its Stokes vector.
+_LIGHT = re.compile(r"m00(, m[123]0)+")
+
+
+def fact_lines(facts: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
+    """Of each fact how it is called and its value, in words; those of a Stokes vector speak of S."""
+    lines = {name: (name.replace("_", " "), fact_words(value)) for name, value in facts.items()}
+    if _LIGHT.fullmatch(str(facts.get("determined"))):
+        lines = {n: (label.replace("mij over m00", "si over s0"), text) for n, (label, text) in lines.items()}
+        lines["determined"] = ("determined", re.sub(r"m(\d)0", r"s\1", str(facts["determined"])))
+    return lines
 
 
 def fact_words(value: Any) -> str:
@@ -26,7 +39,8 @@ def _inputs(text: str) -> str:
     """A text; where it lists directions of several inputs each, as a;b, the inputs that most of them have."""
     directions = [one.split(", ") for one in text.split("; ")]
     count = Counter(name for one in directions for name in one)
-    if len(directions) < 2 or len(count) <= MOST_NAMED:
+    if len(directions) < 2 or max(len(count), len(directions)) <= MOST_NAMED:
         return text
     named = ", ".join(name for name, _ in count.most_common(MOST_NAMED))
-    return f"{named} and {len(count) - MOST_NAMED} more, in {len(directions)} directions"
+    more = f" and {len(count) - MOST_NAMED} more" if len(count) > MOST_NAMED else ""
+    return f"{named}{more}, in {len(directions)} directions"

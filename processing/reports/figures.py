@@ -21,7 +21,7 @@ from processing.reports.figure_style import (
     thin,
 )
 from processing.reports.quantities_figures import quantities_figure
-from processing.storage.products.product import LIT_ERRORS, Product
+from processing.storage.products.product import Product, is_lit
 from processing.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -53,13 +53,13 @@ def product_figure(product: Product) -> Figure:
         return _polarimeter_figure(product, *light)
     if product.kind in ("mueller", "extrapolated"):
         elements = thin(product.get("mueller"))
-        lit = _lit(elements[0, 0], thin(product.get("mueller_errors")[0, 0]))
+        lit = is_lit(elements[0, 0], thin(product.get("mueller_errors")[0, 0]))
         title = _title(product) if product.kind == "mueller" else f"extrapolated: {_title(product)}"
         return mueller_figure(elements, lit, title, product.simulated)
     if product.kind == "stokes":
         names = ("s0", "dolp", "dolp_errors", "aolp_deg", "aolp_deg_errors")
         maps = {name: thin(product.get(name)) for name in names}
-        dark = ~_lit(maps["s0"], thin(product.get("s0_errors")))
+        dark = ~is_lit(maps["s0"], thin(product.get("s0_errors")))
         for name in names[1:]:
             maps[name][dark] = np.nan
         return stokes_figure(maps, _title(product), product.simulated)
@@ -161,12 +161,6 @@ def photon_transfer_figure(product: Product) -> Figure:
     return figure
 
 
-def _lit(intensity: NDArray[Any], error: NDArray[Any]) -> NDArray[np.bool_]:
-    # Where the noise is not known the error is NaN, and any light counts.
-    with np.errstate(invalid="ignore"):
-        return np.asarray(intensity > LIT_ERRORS * np.nan_to_num(error))
-
-
 def _title(product: Product) -> str:
     header = product.header
     wavelength = f"{header.wavelength_nm:g} nm"
@@ -194,7 +188,7 @@ def _polarimeter_figure(product: Product, stokes: NDArray[Any], errors: NDArray[
     Dark pixels stay grey. A product of `process quantities` has its own maps, without the noise in magnitudes.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        lit = _lit(stokes[0], errors[0])
+        lit = is_lit(stokes[0], errors[0])
         s1, s2, s3 = np.where(lit, stokes[1:] / stokes[0], np.nan)
         linear = np.hypot(s1, s2)
         noise = np.hypot(s1 * errors[2], s2 * errors[1]) / (2 * linear**2 * stokes[0])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from processing.polarization import gradients
 from processing.reports.figure_style import CYCLIC, PANEL_PIXELS, WORST_ORIENTATION_DEG, grid_figure
 from processing.storage.products.images import MuellerImage
-from processing.storage.products.product import LIT_ERRORS, Product
+from processing.storage.products.product import Product, is_lit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,7 +29,7 @@ def mueller_maps(product: Product, title: str) -> Figure | None:
     m = image.matrices.astype(float)
     with np.errstate(divide="ignore", invalid="ignore"):
         derived = gradients.coherency(m) | gradients.polarizance(m)
-    lit = image.values[0, 0] > LIT_ERRORS * np.nan_to_num(image.errors[0, 0])
+    lit = is_lit(image.values[0, 0], image.errors[0, 0])
 
     def values(name: str) -> NDArray[Any]:
         value = derived[name].value

@@ -20,7 +20,7 @@ from processing.maps.means import BUDGET_COLUMNS, mean_of
 from processing.maps.region import parse_region
 from processing.reflectance.tables import ScatteringTable, is_table
 from processing.reports.capture_facts import facts_of, papers_of
-from processing.reports.fact_words import fact_words
+from processing.reports.fact_words import fact_lines, fact_words
 from processing.reports.figure_style import map_figure, png, thin
 from processing.reports.figures import product_figure
 from processing.reports.mueller_maps import mueller_maps
@@ -197,7 +197,7 @@ def _product(path: Path) -> Section:
     with Product(path) as product:
         facts = {k: v for k, v in product.facts.items() if k not in ("warnings", "masked")}
         summary = [("kind", f"{product.kind} image, {'simulated' if product.simulated else 'measured'}")]
-        summary += [(name.replace("_", " "), fact_words(value)) for name, value in facts.items()]
+        summary += fact_lines(facts).values()
         figures = []
         # A kind without a figure is reported by its numbers.
         with suppress(ProcessError):

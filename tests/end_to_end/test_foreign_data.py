@@ -97,6 +97,71 @@ def test_hdf5_in_radians_with_darks_in_another_dataset(configs, tmp_path, proces
     assert mueller_of(process, out) == pytest.approx(SAMPLE, abs=2e-3)
 
 
+@pytest.mark.parametrize("kind", ["npz", "struct", "folders", "repeats", "one column"])
+def test_other_files_of_the_same_scan(configs, tmp_path, process, drr, kind, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    frames = frames_of(configs, "drr_5to1.yaml", drr)[:, 0] - DARK
+    instrument = configs / "instruments" / "drr_5to1.yaml"
+    np.savetxt("angles.csv", np.stack([drr["psg"], drr["psa"]], axis=1), delimiter=",", header="psg,psa")
+    options = ["--states", "angles.csv"]
+    if kind == "npz":
+        np.savez_compressed("run.npz", frames=frames, **drr)
+        options = ["--columns", "psg=run.npz::psg", "--columns", "psa=run.npz::psa", "--stack", "run.npz::frames"]
+    elif kind == "struct":
+        savemat("run.mat", {"data": {"img": np.moveaxis(frames, 0, -1), "deg": drr}, "note": "x"})
+        axes = (f"{axis}=run.mat::data.deg.{axis}" for axis in ("psg", "psa"))
+        options = [*(word for axis in axes for word in ("--columns", axis)), "--stack", "run.mat::data.img"]
+    elif kind == "repeats":
+        np.save("run.npy", frames.repeat(3, axis=0))
+        options += ["--stack", "run.npy", "--repeats", "3"]
+    elif kind == "one column":
+        # A gear: one motor turns both plates.
+        np.savetxt("angles.csv", drr["psg"], header="motor", comments="")
+        words = instrument.read_text().replace("axis: psa,", "axis: psa, ratio: 5,")
+        assert "ratio: 5" in words
+        instrument = tmp_path / "geared.yaml"
+        instrument.write_text(words)
+        np.save("run.npy", frames)
+        options += ["--columns", "psg=motor", "--columns", "psa=motor", "--stack", "run.npy"]
+    else:
+        # Written last to first: the order in the folder is not that of the states.
+        for k in reversed(range(len(frames))):
+            (tmp_path / f"state_{k}").mkdir()
+            cv2.imwrite(f"state_{k}/frame.tif", frames[k])
+        options += ["--stack", "state_*/frame.tif"]
+    out = tmp_path / "sample.h5"
+    code, _, said = process("import", *options, "--wavelength-nm", 532, "--instrument", instrument, "--out", out)
+    assert code == 0, said
+    assert mueller_of(process, out) == pytest.approx(SAMPLE, abs=2e-3)
+
+
+def test_scenes_of_a_polarization_camera_are_not_averaged(configs, tmp_path, process):
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"scene{k}.png"), np.full((8, 8), 1000 + k, np.uint16))
+    camera = configs / "instruments" / "linear_stokes.yaml"
+    command = ("import", "--stack", tmp_path, "--wavelength-nm", 550, "--instrument", camera)
+    _, said, _ = process(*command, "--out", tmp_path / "all.h5")
+    assert "3 frames in which nothing turns: `reduce` averages them. If each is a scene, add --each" in said
+    code, said, _ = process(*command, "--each", "--out", tmp_path / "each")
+    assert (code, said.splitlines()[-1]) == (0, "3 inputs: 3 made, 0 unchanged, 0 failed")
+    with Capture(tmp_path / "each" / "scene2.h5") as capture:
+        assert capture.frames(0)[0, 0, 0] == 1002
+    again = process("import", "--recipe", tmp_path / "each" / "each.import.yaml", "--out", tmp_path / "each")
+    assert again[1].splitlines()[-1] == "3 inputs: 0 made, 3 unchanged, 0 failed"
+
+
+def test_a_liquid_crystal_polarimeter_has_a_measured_w_and_no_angles(tmp_path, process):
+    rng = np.random.default_rng(4)
+    w = rng.normal(0, 0.1, (20, 16)) + np.eye(16)[0]
+    rows = "".join(f"    - {row.tolist()}\n" for row in w)
+    (tmp_path / "lc.yaml").write_text(f"kind: instrument\nname: lc\nmeasured:\n  u: 0.002\n  rows:\n{rows}")
+    np.save(tmp_path / "run.npy", (w @ SAMPLE.reshape(16) * 8000).round().astype(np.uint16)[:, None, None].repeat(4, 1))
+    out = tmp_path / "sample.h5"
+    command = ("import", "--stack", tmp_path / "run.npy", "--instrument", tmp_path / "lc.yaml", "--wavelength-nm", 550)
+    assert process(*command, "--out", out)[0] == 0
+    assert mueller_of(process, out) == pytest.approx(SAMPLE, abs=5e-3)
+
+
 @pytest.mark.parametrize("kind", ["npy", "mat"])
 def test_a_stokes_polarimeter_of_twelve_states(configs, tmp_path, process, kind):
     angles = {"psa": np.arange(12) * 15.0}

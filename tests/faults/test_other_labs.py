@@ -180,3 +180,64 @@ def test_a_table_without_names_is_refused_with_what_to_type(lab, drr, tmp_path, 
     np.savetxt(tmp_path / "t.txt", np.ones((6, 2)))
     given = ("--states", tmp_path / "t.txt", "--stack", tmp_path / "Läufe")
     assert "--columns 'psg=" in process_refuses("import", *given, *drr)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Date: 2026-11-25 10:12, operator Anna\nCamera X, 20 ms\n\nWinkel,psa\n-7.5,1\n372.5,2\n",
+        "LabVIEW Measurement\t\n***End_of_Header***\t\nWinkel\tpsa\n-7.5\t1\t\n372.5\t2\t\n",
+        "Winkel,psa\ndeg,deg\n-7.5,1\n372.5,2\n",
+        'Winkel,psa\n"-7,5","1,0"\n"372,5","2,0"\n',
+        "Winkel;psa\n-7,5°;1°\n372,5°;2 °\n",
+    ],
+    ids=["words before", "LabVIEW", "line of units", "quoted decimal commas", "degree signs"],
+)
+def test_tables_of_other_programs(tmp_path, text):
+    path = tmp_path / "t.csv"
+    path.write_text(text, encoding="utf-8")
+    states = read_states(path, ["psg", "psa"], {"psg": "Winkel"})
+    assert states.angles_deg["psg"].tolist() == [-7.5, 372.5]
+    assert states.angles_deg["psa"].tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("head", "scale", "word"),
+    [
+        ("a,b", 1000, "probably steps of a motor"),
+        ("a (mdeg),b (mdeg)", 1, "probably steps"),
+        ("a,b\nrad,rad", 1, "radians"),
+    ],
+)
+def test_numbers_that_are_no_degrees_are_refused(drr, lab, tmp_path, process_refuses, head, scale, word):
+    table = tmp_path / "log.csv"
+    table.write_text(head + "\n" + "".join(f"{12.5 * k * scale},{62.5 * k * scale}\n" for k in range(6)))
+    a, b = head.splitlines()[0].split(",")
+    given = ("--states", table, "--columns", f"psg={a}", "--columns", f"psa={b}", "--stack", tmp_path / "Läufe")
+    assert word in process_refuses("import", *given, *drr)
+
+
+def test_frames_that_cannot_be_raw_are_refused(drr, tmp_path, process_refuses):
+    for k in range(6):
+        cv2.imwrite(str(tmp_path / f"G{12.5 * k}_A{62.5 * k}.jpg"), FRAMES[k].astype(np.uint8))
+    assert "JPEG changes the grey values" in process_refuses("import", "--stack", tmp_path / "G{psg}_A{psa}.jpg", *drr)
+
+
+def test_an_array_that_is_not_in_a_file_is_answered_with_those_that_are(drr, tmp_path, process_refuses):
+    with h5py.File(tmp_path / "run.h5", "w") as h5:
+        h5["scan/frames"], h5["scan/angle"] = FRAMES, ANGLES["psg"]
+    np.savez(tmp_path / "run.npz", frames=FRAMES, angle=ANGLES["psg"])
+    for file, names in (("run.h5", "/scan/angle, /scan/frames"), ("run.npz", "frames, angle")):
+        said = process_refuses("import", "--columns", f"psg={tmp_path / file}::psg", "--stack", tmp_path / file, *drr)
+        assert f"it has {names}" in said
+
+
+def test_an_archive_that_promises_more_than_it_holds_is_refused(drr, tmp_path, process_refuses):
+    np.savez(tmp_path / "run.npz", frames=FRAMES)
+    data = (tmp_path / "run.npz").read_bytes()
+    assert data.count(b"(6, 4, 5)") == 1
+    data = data.replace(b"(6, 4, 5), }          ", b"(6, 9999999999, 5), } ")
+    (tmp_path / "run.npz").write_bytes(data)
+    np.save(tmp_path / "a.npy", ANGLES["psg"])
+    axes = ("--columns", f"psg={tmp_path}/a.npy", "--columns", f"psa={tmp_path}/a.npy")
+    assert "run.npz" in process_refuses("import", *axes, "--stack", f"{tmp_path}/run.npz::frames", *drr)

@@ -18,6 +18,7 @@ from processing.reports.fact_words import fact_words
         ([1.0, float("nan")], "1, none"),
         ("a x, b; a x, c; a x, b, d, e, f", "a x, b, c, d and 2 more, in 3 directions"),
         ("a x; b y", "a x; b y"),
+        ("; ".join(["W"] * 8), "W, in 8 directions"),
         ({"rank_lost": 2, "where": None}, "rank lost 2, where none"),
     ],
 )

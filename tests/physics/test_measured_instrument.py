@@ -10,6 +10,7 @@ from processing.polarization import mueller
 from processing.steps.reduction import Reduction
 from processing.storage.captures.capture import Capture
 from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import Product
 from processing.yaml_file import dump_yaml
 
 #: Four elliptical states on the sphere, and eight between them: of a liquid crystal polarimeter, say.
@@ -63,6 +64,26 @@ def test_a_measured_w_of_four_numbers_is_a_stokes_polarimeter(synthetic_capture)
     assert image.seen.reshape(4, 4).tolist() == [[True, False, False, False]] * 4
     s = image.values.mean(axis=(2, 3))[:, 0]
     np.testing.assert_allclose(s / s[0], light, atol=1e-3)
+
+
+def test_the_uncertainty_of_a_measured_w_is_that_of_drawn_ones(synthetic_capture):
+    rng = np.random.default_rng(8)
+    g, a = states_of(24), states_of(24)
+    w = np.einsum("ni,nj->nij", a, g).reshape(24, 16)
+    true = (mueller.retarder(0.4, 1.1) @ mueller.diattenuator(0.2, 1.0, 0.6)).reshape(16)
+    path = capture_of(synthetic_capture, w, true, InstrumentModel.model_validate(measured(w, u=0.004)))
+    with Product(Reduction(path).make()) as product:
+        stated = product.get("mueller_systematic").mean(axis=(2, 3)).reshape(16) / product.get("mueller")[0, 0].mean()
+    drawn = np.array([np.linalg.pinv(w + rng.normal(0, 0.004, w.shape)) @ w @ true for _ in range(3000)])
+    spread = (drawn / drawn[:, :1]).std(axis=0)
+    np.testing.assert_allclose(stated[1:], spread[1:], rtol=0.08)
+
+
+def test_a_measured_w_needs_neither_trains_nor_numbers_of_its_states():
+    w = states_of(6)
+    short = InstrumentModel.model_validate({"name": "lc", "measured": {"rows": w.tolist()}})
+    long = InstrumentModel.model_validate(measured(w))
+    np.testing.assert_array_equal(short.rows({"state": [4, 0]}), long.rows({"state": [4, 0]}))
 
 
 def test_a_state_that_was_not_measured_is_refused_by_its_angles():

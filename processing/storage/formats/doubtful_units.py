@@ -15,6 +15,9 @@ STEP_DEG = 1.0
 MOST_RAD = 10 * np.pi
 #: No polarimeter of plates and polarizers works outside these wavelengths, far ultraviolet to terahertz.
 WAVELENGTHS_NM = (100.0, 3e6)
+#: No scan takes so many turns.
+MOST_TURNS = 100
+_STEPS = re.compile(r"(?<![a-z])(steps?|counts?|ticks|pulses|m(illi)?deg(rees?)?)(?![a-z])", re.IGNORECASE)
 _RADIANS = re.compile(r"(?<![a-z])rad(ians?)?(?![a-z])", re.IGNORECASE)
 _MILLISECONDS = re.compile(r"(?<![a-z])(ms|msec|milliseconds?)(?![a-z])", re.IGNORECASE)
 #: Nanometres in other units of length.
@@ -26,7 +29,7 @@ def require_unit(states: StatesFile, columns: Mapping[str, str], angles: str | N
     for name, degrees in states.angles_deg.items():
         known = np.unique(degrees[np.isfinite(degrees)])
         turn = float(np.ptp(known)) if known.size else 0.0
-        unit = stated_unit(columns.get(name, columns.get(f"{name}_deg", "")))
+        unit = _unit_of(states, columns.get(name, columns.get(f"{name}_deg", name)))
         if angles == "radians" and np.deg2rad(turn) > 2 * MOST_RAD:
             raise ImportFailed(
                 f"{states.path}: axis {name} turns by {np.deg2rad(turn):.3g} radians, which is {turn / 360:.3g} turns. "
@@ -34,6 +37,11 @@ def require_unit(states: StatesFile, columns: Mapping[str, str], angles: str | N
             )
         if angles is not None:
             continue
+        if turn > MOST_TURNS * 360 or _STEPS.search(unit):
+            raise ImportFailed(
+                f"{states.path}: axis {name} turns by {turn:.6g} degrees, which is {turn / 360:.3g} turns. These "
+                "numbers are probably steps of a motor. Convert them to degrees, or add --angles degrees"
+            )
         small = known.size > 2 and turn <= MOST_RAD and np.diff(known).max() < STEP_DEG
         if small or _RADIANS.search(unit):
             why = f"{unit.strip()!r} says so" if _RADIANS.search(unit) else f"in steps below {STEP_DEG:g}"
@@ -42,11 +50,15 @@ def require_unit(states: StatesFile, columns: Mapping[str, str], angles: str | N
                 "These angles are probably in radians. Add --angles radians, or --angles degrees"
             )
     for name in ("exposure_s", "time_s"):
-        if name in columns and _MILLISECONDS.search(stated_unit(columns[name])):
+        if name in columns and _MILLISECONDS.search(_unit_of(states, columns[name])):
             raise ImportFailed(
                 f"{states.path}: {name} is in seconds, and the column is {columns[name]!r}. "
                 f"Add --columns '{name.removesuffix('s')}ms={columns[name]}'"
             )
+
+
+def _unit_of(states: StatesFile, column: str) -> str:
+    return f"{stated_unit(column)} {states.units.get(column, '')}"
 
 
 def require_nm(wavelength_nm: float) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from processing.doors import one_line, read_text_of_any_system, require_file
 from processing.errors import ProcessError
-from processing.storage.integrity.h5_door import damage_as, open_h5, read_npy, require_dataset
+from processing.storage.integrity.h5_door import damage_as, open_h5, read_npy, read_npz, require_dataset
 
 
 class ImportFailed(ProcessError):
@@ -25,7 +26,7 @@ class ImportFailed(ProcessError):
 #: Kinds of files with one frame each.
 FRAME_SUFFIXES = (".npy", ".png", ".tif", ".tiff")
 #: Files with named or single arrays.
-ARRAY_SUFFIXES = (".npy", ".mat", ".h5", ".hdf5", ".hdf", ".nxs")
+ARRAY_SUFFIXES = (".npy", ".npz", ".mat", ".h5", ".hdf5", ".hdf", ".nxs")
 #: Text files with numbers in columns, without names.
 TEXT_SUFFIXES = (".txt", ".dat", ".csv", ".tsv")
 #: FILE, an optional ::NAME, and an optional column [K] or [FIELD].
@@ -48,7 +49,7 @@ def read_column(text: str) -> NDArray[np.float64]:
 
     Parameters
     ----------
-    text : `FILE::NAME` (HDF5, .mat) or `FILE.npy`; `[K]` at its end takes column K of a table.
+    text : `FILE::NAME` (HDF5, .mat, .npz) or `FILE.npy`; `[K]` at its end takes column K of a table.
 
     Raises
     ------
@@ -104,7 +105,9 @@ def _text_table(file: Path) -> NDArray[np.float64]:
 
 
 def open_array(text: str, kinds: str = "uif") -> Any:
-    """An array with shape, dtype and slices, as `FILE.npy`, `FILE::NAME` of HDF5 or `FILE.mat::NAME`.
+    """An array with shape, dtype and slices, as `FILE.npy`, or `FILE::NAME` of HDF5, .npz or .mat.
+
+    A field of a MATLAB struct is `FILE.mat::STRUCT.FIELD`.
 
     Parameters
     ----------
@@ -120,10 +123,16 @@ def open_array(text: str, kinds: str = "uif") -> Any:
         require_file(file, ImportFailed)
         if name.endswith(".npy"):
             return read_npy(file, ImportFailed)
+        if name.endswith(".npz"):
+            return _of_archive(file, inside)
         if name.endswith(".mat") and not h5py.is_hdf5(file):
             return _matlab_array(file, inside)
         h5 = open_h5(file, ImportFailed)
+        if name.endswith(".mat"):
+            inside = inside.replace(".", "/")
         inside = inside or _only_stack(h5, name)
+        if inside not in h5:
+            raise ImportFailed(f"{file}: no dataset {inside!r}; it has {_named(_datasets(h5))}")
         dataset = require_dataset(h5, inside, (None,) * getattr(h5.get(inside), "ndim", 3), kinds)
         # MATLAB writes its axes in the order of Fortran.
         return dataset[...].T if name.endswith(".mat") else dataset
@@ -168,7 +177,7 @@ def frame_files(text: str) -> FrameFiles | None:
 
 
 def _naturally(files: list[Path]) -> list[Path]:
-    return sorted(files, key=lambda f: [int(p) if p.isdecimal() else p for p in re.split(r"(\d+)", f.name)])
+    return sorted(files, key=lambda f: [int(p) if p.isdecimal() else p for p in re.split(r"(\d+)", str(f))])
 
 
 def missing_numbers(files: Sequence[Path]) -> str:
@@ -193,18 +202,57 @@ def states_first(stack: Any, states: int | None, frame: tuple[int, int] | None =
 def _matlab_array(file: Path, name: str) -> NDArray[Any]:
     from scipy.io import loadmat, whosmat
 
-    arrays = {n: shape for n, shape, _ in whosmat(file)}
-    name = name or (next(iter(arrays)) if len(arrays) == 1 else "")
+    arrays = [n for n, _, _ in whosmat(file)]
+    name = name or (arrays[0] if len(arrays) == 1 else "")
+    first, *fields = name.split(".")
+    _require_array(file, first, arrays)
+    values = np.asarray(loadmat(file, variable_names=[first])[first])
+    while values.dtype.names is not None and values.size == 1:
+        # A struct: an array of one record, whose fields are arrays again.
+        inside = [f"{first}.{field}" for field in values.dtype.names]
+        first = f"{first}.{fields.pop(0)}" if fields else ""
+        _require_array(file, first, inside)
+        values = np.asarray(values[first.rpartition(".")[2]].item())
+    if fields or values.dtype.kind not in "uif":
+        raise ImportFailed(f"{file}: {name} holds {values.dtype.name}, not an array of numbers")
+    return values
+
+
+def _of_archive(file: Path, name: str) -> NDArray[Any]:
+    try:
+        arrays = [n.removesuffix(".npy") for n in zipfile.ZipFile(file).namelist()]
+    except zipfile.BadZipFile as why:
+        raise ImportFailed(f"{file}: is no .npz file ({one_line(why)})") from why
+    name = name.lstrip("/") or (arrays[0] if len(arrays) == 1 else "")
+    _require_array(file, name, arrays)
+    return read_npz(file, name, ImportFailed)
+
+
+def _require_array(file: Path, name: str, arrays: Sequence[str]) -> None:
     if name not in arrays:
         asked = f"no array {name!r}; " if name else ""
-        raise ImportFailed(f"{file}: {asked}it has {', '.join(arrays) or 'none'}. Choose one as {file}::NAME")
-    return np.asarray(loadmat(file, variable_names=[name])[name])
+        raise ImportFailed(f"{file}: {asked}it has {_named(arrays)}. Choose one as {file}::NAME")
+
+
+def _named(names: Sequence[str]) -> str:
+    return one_line(", ".join(names), 300) or "none"
+
+
+def _datasets(h5: h5py.File, dimensions: int = 0) -> list[str]:
+    found: list[str] = []
+
+    def look(name: str, item: h5py.Dataset | h5py.Group) -> None:
+        if isinstance(item, h5py.Dataset) and item.ndim >= dimensions:
+            found.append(f"/{name}")
+
+    h5.visititems(look)
+    return found
 
 
 def _only_stack(h5: h5py.File, file: str) -> str:
-    found: list[str] = []
-    h5.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) and item.ndim >= 3 else None)
+    found = _datasets(h5, 3)
     if len(found) != 1:
-        shown = ", ".join(found) or "none"
-        raise ImportFailed(f"{file}: datasets with three or four dimensions: {shown}. Choose one as {file}::/NAME")
+        raise ImportFailed(
+            f"{file}: datasets with three or four dimensions: {_named(found)}. Choose one as {file}::/NAME"
+        )
     return found[0]

@@ -15,6 +15,7 @@ from processing.storage.integrity.h5_door import damage_as, read_npy
 
 #: Kinds of pictures that may have several pages.
 PAGED = (".tif", ".tiff")
+LOSSY = (".jpg", ".jpeg")
 
 
 def read_frame(file: Path, page: int | None = None) -> NDArray[Any]:
@@ -30,6 +31,11 @@ def read_frame(file: Path, page: int | None = None) -> NDArray[Any]:
 def _read_picture(file: Path, page: int | None) -> NDArray[Any]:
     import cv2
 
+    if file.suffix.lower() in LOSSY:
+        raise ImportFailed(
+            f"{file}: JPEG changes the grey values, and a gamma curve is usual in it: no polarization can be computed "
+            "from them. Give the raw frames of the camera as PNG, TIFF or .npy"
+        )
     pages = require_picture(file, ImportFailed)
     if page is None and pages > 1:
         raise ImportFailed(

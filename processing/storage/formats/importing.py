@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from processing.computing.threads import thread_count
 from processing.doors import one_line, read_text, require_picture, require_place, require_room
+from processing.instrument.measured import NUMBER
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.nexus import attach
 from processing.storage.captures.schema import CaptureHeader, Detector, Sample, create_layout, write_closing
@@ -73,6 +74,7 @@ class ImportRequest:
     columns: dict[str, str] = field(default_factory=dict)
     angles: Literal["degrees", "radians"] | None = None
     darks: str | None = None
+    repeats: int = 1
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ def understand(request: ImportRequest) -> Understood:
     places = _places(request.stack, found)
     names = tuple(c.name for c in model.channels) if model and model.mosaic is None else ("camera",)
     count = None
-    if model is not None and not model.axes and request.stack is not None:
+    if model is not None and set(model.axes) <= {NUMBER} and request.stack is not None and request.states is None:
         # Nothing turns: each frame is a state, and no table has to say more of it.
         count = len(places) if places else _count(request.stack, len(names))
     states = read_states(
@@ -113,7 +115,10 @@ def understand(request: ImportRequest) -> Understood:
         count=count,
         source=request.stack or "frames",
     )
+    if model is not None and NUMBER in model.axes:
+        states = replace(states, angles_deg={**states.angles_deg, NUMBER: np.arange(len(states), dtype=float)})
     require_unit(states, request.columns, request.angles)
+    states = states.repeated(request.repeats)
     _require_one_source(request, states, has_folder=bool(places or found))
     if states.files is not None:
         folder = states.path.parent
@@ -127,6 +132,21 @@ def understand(request: ImportRequest) -> Understood:
     if request.darks is not None:
         states, source = _with_darks(request.darks, states, source)
     return Understood(states, source, model)
+
+
+def scenes_of(request: ImportRequest, out: Path | None) -> list[ImportRequest]:
+    """A request for each frame of a folder or a pattern, into a folder: `out`, or that of the frames.
+
+    Raises
+    ------
+    ImportFailed : the frames are no files of one frame each.
+    """
+    found = frame_files(request.stack or "")
+    if found is None or request.states is not None:
+        raise ImportFailed("--each takes frames that are files: --stack FOLDER or a pattern such as 'run/*.png'")
+    folder = out or found.files[0].parent
+    folder.mkdir(parents=True, exist_ok=True)
+    return [replace(request, stack=str(file), out=folder / f"{file.stem}.h5") for file in found.files]
 
 
 def _places(stack: str | None, found: FrameFiles | None) -> tuple[Place, ...]:
@@ -188,9 +208,12 @@ def _require_order(request: ImportRequest, states: StatesFile, found: FrameFiles
     if len(found.files) != len(states):
         gap = missing_numbers(found.files)
         numbers = f"; their names leave out {one_line(gap, 60)}" if gap else ""
+        often, more = divmod(len(found.files), len(states))
         raise ImportFailed(
-            f"{request.stack}: {len(found.files)} frames for {len(states)} states of {states.path}{numbers}. Remove "
-            "what has no counterpart, or name the frames in a column of the table: --columns file=COLUMN"
+            f"{request.stack}: {len(found.files)} frames for {len(states)} states of {states.path}{numbers}. "
+            + (f"If each state has {often} frames, one after the other, add --repeats {often}. " if not more else "")
+            + "Choose frames by a pattern, as --stack 'FOLDER/img_*.tif', or by a column of the table: --columns "
+            "file=COLUMN"
         )
 
 
@@ -288,6 +311,9 @@ def _fluxes(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
 
 def _stack(text: str, states: StatesFile, names: tuple[str, ...]) -> FrameSource:
     stack = open_stack(text, len(states))
+    if len(stack.shape) == 1:
+        # A flux a state.
+        stack = stack[...][:, None, None]
     if len(states) == 1 and len(stack.shape) in (2, 3) and len(stack.shape) - 2 == (len(names) > 1):
         stack = stack[...][None]
     check_stack(text, stack, len(states), len(names))

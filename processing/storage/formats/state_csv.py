@@ -6,7 +6,7 @@ import csv
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +28,12 @@ IN_ORDER = "rows"
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_ .-]{0,63}")
 #: What may stand between columns; a spreadsheet takes semicolons where the comma is in the numbers.
 DELIMITERS = ",;\t"
+_THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3})+(\.\d*)?")
 #: Largest angle in degrees; controllers count no further.
 MOST_DEG = 1e6
 MOST_COLUMNS = 200
+#: Lines of words before the header of a table, at most.
+MOST_LINES_BEFORE = 60
 MOST_STATES = 100_000
 
 
@@ -53,6 +56,7 @@ class StatesFile:
     files : N names of files as they stand in the table, or None.
     channels : channel name to (N,) flux; empty if there are none.
     ignored : columns of the table that are not used: header to N cells.
+    units : header to unit, where the table has a line of units below its header.
     """
 
     path: Path
@@ -65,9 +69,30 @@ class StatesFile:
     files: tuple[str, ...] | None
     channels: dict[str, NDArray[np.float64]]
     ignored: dict[str, list[str]]
+    units: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.role)
+
+    def repeated(self, times: int) -> StatesFile:
+        """Each state so many times, one after the other."""
+        if times == 1 or self.files is not None:
+            return self
+
+        def longer(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+            return None if values is None else values.repeat(times)
+
+        return replace(
+            self,
+            line=tuple(np.repeat(self.line, times).tolist()),
+            role=tuple(np.repeat(self.role, times).tolist()),
+            angles_deg={name: values.repeat(times) for name, values in self.angles_deg.items()},
+            time_s=longer(self.time_s),
+            exposure_s=longer(self.exposure_s),
+            sigma=longer(self.sigma),
+            channels={name: values.repeat(times) for name, values in self.channels.items()},
+            ignored={name: np.repeat(cells, times).tolist() for name, cells in self.ignored.items()},
+        )
 
 
 def read_states(
@@ -83,7 +108,7 @@ def read_states(
     """Read a states file (CSV with a header line), arrays with a number a state, or both.
 
     Columns are apart by commas, semicolons, tabs or blanks, as the header has them. Beside semicolons and tabs numbers
-    may have decimal commas; then none has a point. Lines before the header that begin with # are comments.
+    may have decimal commas; then none has a point. Lines before the header, and one of units after it, are skipped.
 
     Parameters
     ----------
@@ -104,9 +129,11 @@ def read_states(
     mapping = {_axis_name(name): text for name, text in (columns or {}).items()}
     known = {name: read_column(text) for name, text in mapping.items() if is_array(text)} | dict(arrays or {})
     if path is not None:
-        header, rows, delimiter = _table(path)
+        header, rows, units, delimiter = _table(
+            path, [text for name, text in mapping.items() if name not in known and text != IN_ORDER]
+        )
     else:
-        header, rows, delimiter = [], _rows_without_table(known, count), ","
+        header, rows, units, delimiter = [], _rows_without_table(known, count), {}, ","
     path = path or Path(next((t for t in mapping.values() if is_array(t)), source).partition("::")[0])
     ignored: dict[str, list[str]] = {}
     if mapping:
@@ -135,7 +162,9 @@ def read_states(
     texts_of = {name: [values[k] for k in order] for name, values in texts_of.items()}
     role = _roles(path, lines, texts_of)
     cells = {n: texts_of[n] for n in names if n not in ("state", "role", "file")}
-    decimal_commas = delimiter != "," and any("," in text for texts in cells.values() for text in texts)
+    with_comma = [text for texts in cells.values() for text in texts if "," in text]
+    # Between commas a number has quotes, and its comma may part thousands.
+    decimal_commas = bool(with_comma) and (delimiter != "," or not all(map(_THOUSANDS.fullmatch, with_comma)))
     numbers = {
         n: _numbers(path, lines, n, texts, role=role, decimal_commas=decimal_commas) for n, texts in cells.items()
     }
@@ -160,6 +189,7 @@ def read_states(
         files=files,
         channels={n.removeprefix(CHANNEL_PREFIX): v for n, v in numbers.items() if n.startswith(CHANNEL_PREFIX)},
         ignored={name: [cells[k] for k in order] for name, cells in ignored.items()},
+        units=units,
     )
 
 
@@ -184,13 +214,15 @@ def _mapped(
     absent = [text for text in mapping.values() if text not in header]
     if absent:
         raise ImportFailed(f"{path}:1: no column {absent[0]!r}. Found: {', '.join(header)}")
-    named = {text: name for name, text in mapping.items()}
     kept, ignored = [], {}
     for k, h in enumerate(header):
         of_file = _axis_name(h) not in mapping and _is_known(h, _axis_name(h), axes)
-        if h in named or (of_file and not (in_order and h == "state")):
-            kept.append((k, named.get(h, h)))
-        else:
+        # One column may turn two axes.
+        names = [name for name, text in mapping.items() if text == h]
+        if not names and of_file and not (in_order and h == "state"):
+            names = [h]
+        kept += [(k, name) for name in names]
+        if not names:
             ignored[h] = [row[k] for _, row in rows]
     header, rows = [h for _, h in kept], [(line, [row[k] for k, _ in kept]) for line, row in rows]
     if "state" not in header and not in_order and "file" not in header:
@@ -224,25 +256,23 @@ def _with_arrays(
     return header, rows
 
 
-def _table(path: Path) -> tuple[list[str], list[Row], str]:
-    """Header, rows with their line numbers, and what stands between the columns."""
+def _table(path: Path, wanted: Sequence[str]) -> tuple[list[str], list[Row], dict[str, str], str]:
+    """Header, rows with their line numbers, units that stand in a line of their own, and the delimiter."""
     text_lines = read_text_of_any_system(path, ImportFailed).splitlines(keepends=True)
     first = next((k for k, line in enumerate(text_lines) if line.strip() and not line.startswith("#")), 0)
     if first and _is_all_numbers(text_lines[first]):
         # As numpy writes a table: its names are a comment.
         first -= 1
         text_lines[first] = text_lines[first].lstrip("# ")
-    title = text_lines[first] if text_lines else ""
-    delimiter = max(DELIMITERS, key=title.count)
-    if delimiter not in title and len(text_lines) > first + 1 and len(text_lines[first + 1].split()) > 1:
-        delimiter = " "
-        text_lines = [" ".join(line.split()) + "\n" for line in text_lines]
-    try:
-        reader = csv.reader(text_lines[first:], delimiter=delimiter)
-        header = [h.strip() for h in next(reader, [])]
-        rows = [(first + reader.line_num, [c.strip() for c in row]) for row in reader if any(c.strip() for c in row)]
-    except csv.Error as error:
-        raise ImportFailed(f"{path}: is not a CSV text file ({error})") from error
+    header, rows, delimiter = _parsed(path, text_lines, first)
+    if any(len(row) != len(header) for _, row in rows) or not set(wanted) <= set(header):
+        # A log may begin with lines on the measurement: the header is the first that fits all rows after it.
+        for other in range(first + 1, min(first + MOST_LINES_BEFORE, len(text_lines))):
+            found = _parsed(path, text_lines, other)
+            fits = found[1] and all(len(row) == len(found[0]) for _, row in found[1]) and set(wanted) <= set(found[0])
+            if fits and not any(map(_is_number, found[0])) and (wanted or len(found[0]) > 1):
+                header, rows, delimiter = found
+                break
     if header and all(_is_number(h) for h in header):
         raise ImportFailed(
             f"{path}: has no line with the names of its columns. Without --states, name each column by its number, as "
@@ -257,9 +287,30 @@ def _table(path: Path) -> tuple[list[str], list[Row], str]:
     for line, row in rows:
         if len(row) != len(header):
             raise ImportFailed(f"{path}:{line}: {len(row)} columns, the header has {len(header)}")
+    units: dict[str, str] = {}
+    if len(rows) > 1 and not any(map(_is_number, rows[0][1])) and any(map(_is_number, rows[1][1])):
+        units, rows = dict(zip(header, rows[0][1], strict=True)), rows[1:]
     # Spreadsheets write delimiters behind the last column.
     used = [k for k, h in enumerate(header) if h or any(row[k] for _, row in rows)]
-    return [header[k] for k in used], [(line, [row[k] for k in used]) for line, row in rows], delimiter
+    return [header[k] for k in used], [(line, [row[k] for k in used]) for line, row in rows], units, delimiter
+
+
+def _parsed(path: Path, text_lines: list[str], first: int) -> tuple[list[str], list[Row], str]:
+    """Header and rows from one line on."""
+    title = text_lines[first] if text_lines else ""
+    delimiter = max(DELIMITERS, key=title.count)
+    if delimiter not in title and len(text_lines) > first + 1 and len(text_lines[first + 1].split()) > 1:
+        delimiter = " "
+        text_lines = [" ".join(line.split()) + "\n" for line in text_lines]
+    try:
+        reader = csv.reader(text_lines[first:], delimiter=delimiter)
+        header = [h.strip() for h in next(reader, [])]
+        cells = ((first + reader.line_num, [c.strip() for c in row]) for row in reader)
+        # A logger may write a delimiter behind the last column of the rows alone.
+        rows = [(n, row if any(row[len(header) :]) else row[: len(header)]) for n, row in cells if any(row)]
+    except csv.Error as error:
+        raise ImportFailed(f"{path}: is not a CSV text file ({error})") from error
+    return header, rows, delimiter
 
 
 def _is_number(text: str) -> bool:
@@ -366,7 +417,7 @@ def _numbers(
             out[k] = np.nan
             continue
         try:
-            out[k] = math.nan if "_" in text else float(text.translate(points))
+            out[k] = math.nan if "_" in text else float(text.rstrip(" °").translate(points))
         except ValueError:
             out[k] = np.nan
         if not math.isfinite(out[k]):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import tokenize
+import zipfile
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +13,7 @@ from typing import Any, Self
 
 import h5py
 import numpy as np
-from numpy.lib.format import MAGIC_PREFIX
+from numpy.lib.format import MAGIC_PREFIX, read_array, read_array_header_1_0, read_array_header_2_0, read_magic
 
 from processing.doors import one_line, require_file
 from processing.errors import ProcessError
@@ -172,6 +174,28 @@ def read_npy(path: Path, error: type[ProcessError], most_bytes: int | None = Non
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "uif":
         raise error(f"{path} holds {getattr(values, 'dtype', 'an archive')}, not an array of numbers")
     return values
+
+
+def read_npz(path: Path, name: str, error: type[ProcessError]) -> np.ndarray[Any, np.dtype[Any]]:
+    """An array of plain numbers of a .npz file. Raises `error`."""
+    require_file(path, error)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            member = archive.getinfo(f"{name}.npy")
+            with archive.open(member) as file:
+                version = read_magic(file)
+                shape, _, dtype = (read_array_header_1_0 if version == (1, 0) else read_array_header_2_0)(file)
+            promised = int(np.prod(shape, dtype=object)) * dtype.itemsize
+            if not promised <= member.file_size <= max(member.compress_size, 1) * MOST_RATIO:
+                stored = member.compress_size
+                raise error(f"{path}: {name} should have {promised:,} bytes and has {stored:,} in the file")
+            with archive.open(member) as file:
+                values = read_array(file, allow_pickle=False)
+    except (*DAMAGE, SyntaxError, EOFError, tokenize.TokenError, zipfile.BadZipFile, zlib.error) as why:
+        raise error(f"{path}: {name} cannot be read ({one_line(why)})") from why
+    if values.dtype.kind not in "uif":
+        raise error(f"{path}: {name} holds {values.dtype}, not an array of numbers")
+    return np.asarray(values)
 
 
 def text_attribute(node: Any, name: str) -> str:

@@ -57,6 +57,13 @@ WORTH_SAVING = 0.2
 #: A pixel has light where its intensity is this many standard errors above zero; figures and summaries count those.
 LIT_ERRORS = 10.0
 
+
+def is_lit(intensity: NDArray[np.floating], errors: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which pixels have light; where the noise is not known (NaN) any light counts, where it has no bound none does."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(intensity > LIT_ERRORS * np.where(np.isnan(errors), 0, errors))
+
+
 #: Endings of datasets that say how wrong another one may be.
 COMPANIONS = ("_errors", "_95", "_systematic", "_directions")
 #: Datasets by the name that they had in earlier versions. NeXus keeps the ending `_mask` for the mask of one field.
