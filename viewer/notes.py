@@ -11,6 +11,7 @@ from starlette.responses import JSONResponse
 
 from processing.doors import is_line
 from processing.errors import ProcessError
+from processing.section import Section
 from viewer.library import Library
 from viewer.pages import fields_of, pages_of
 from viewer.side_files import read_kept, write_kept
@@ -23,10 +24,8 @@ LONGEST, LONGEST_TAGS = 2000, 200
 _lock = threading.Lock()
 
 
-class Note(BaseModel):
+class Note(Section):
     """What somebody wrote about a file."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     text: str = ""
     tags: tuple[str, ...] = ()

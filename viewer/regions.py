@@ -23,6 +23,7 @@ from processing.maps.means import mean_of
 from processing.maps.stokes_vector import is_stokes_vector
 from processing.reflectance.shared_noise import shared_variance
 from processing.reports.colours import period_deg
+from processing.section import Section
 from processing.storage.captures.capture import Capture
 from processing.storage.products.images import neighbour_correlation
 from processing.storage.products.product import Product, is_product
@@ -45,10 +46,8 @@ COLUMNS = ("region", "quantity", "unit", "value", "error", "systematic", "spread
 _lock = threading.Lock()
 
 
-class NamedRegion(BaseModel):
+class NamedRegion(Section):
     """Rows and columns of an image of so many (rows, columns), the first and the one after the last."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str = Field(pattern=rf"^{NAME.pattern}$")
     columns: tuple[int, int]

@@ -6,23 +6,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from acquisition.capture.plan import Auto, AutoExposure, MeasurementPlan, Mode, Seconds, exposure_kind
+from processing.section import FiniteSection
 from processing.storage.captures.schema import Sample
 from processing.yaml_file import load_yaml
 from processing.yaml_words import NAME_PATTERN
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
 
 Angle = Annotated[float, Field(allow_inf_nan=False)]
 ByWavelength = Annotated[dict[float, Annotated[float, Field(gt=0)]], Tag("by wavelength")]
 
 
-class AngleSteps(_Part):
+class AngleSteps(FiniteSection):
     """Equal steps from `start` to `stop`, both included; at most 3600."""
 
     start: Angle = Field(description="first angle, degrees")
@@ -43,7 +39,7 @@ class AngleSteps(_Part):
         return self
 
 
-class Reference(_Part):
+class Reference(FiniteSection):
     """A capture of something known, taken first in each block and again after every `every` captures.
 
     A block is what is taken of one sample at one wavelength in one mode. `role` flat marks it as a flat field.
@@ -56,7 +52,7 @@ class Reference(_Part):
     role: Literal["flat", "air", "sample"] | None = Field(default=None, description="flat marks a flat field")
 
 
-class Campaign(_Part):
+class Campaign(FiniteSection):
     """What `acquire --campaign` takes. Relative paths are relative to the campaign file.
 
     `plans` names the plan of each mode, whose sample, wavelength, angle and exposure the campaign replaces.
@@ -137,7 +133,7 @@ class Campaign(_Part):
         return tuple(sorted(self.omega_deg))
 
 
-class CampaignCapture(_Part):
+class CampaignCapture(FiniteSection):
     """One capture of a campaign: its number from 1, its file name, its plan, and whether it is a reference."""
 
     number: int

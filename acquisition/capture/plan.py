@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import Discriminator, Field, Tag, ValidationError, model_validator
 
 from processing.instrument.states import (
     RGB950_RATIO,
@@ -18,6 +18,7 @@ from processing.instrument.states import (
     StateTable,
     rotating_retarders,
 )
+from processing.section import FiniteSection
 from processing.storage.captures.schema import Sample
 from processing.yaml_file import ConfigError, load_yaml
 from processing.yaml_words import NAME_PATTERN, mistakes_of, words_of
@@ -29,11 +30,7 @@ Mode = Annotated[str, Field(pattern=NAME_PATTERN)]
 ARM = "arm"
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class RotatingRetarders(_Part):
+class RotatingRetarders(FiniteSection):
     """Equal steps of the generator retarder; the analyzer retarder turns `ratio` times as far.
 
     `axes` names the generator's axis and the analyzer's.
@@ -56,7 +53,7 @@ class RotatingRetarders(_Part):
         return dict(rotating_retarders(1.0, self.states, self.step_deg, self.ratio, axes=self.axes).angles_deg)
 
 
-class FixedPose(_Part):
+class FixedPose(FiniteSection):
     """Every frame in the same pose, the one that the rig file gives for the mode."""
 
     kind: Literal["fixed"] = "fixed"
@@ -67,7 +64,7 @@ class FixedPose(_Part):
         return {}
 
 
-class ListedStates(_Part):
+class ListedStates(FiniteSection):
     """Any table: a list of angles for each axis, all of one length."""
 
     kind: Literal["table"]
@@ -95,7 +92,7 @@ class ListedStates(_Part):
 States = Annotated[RotatingRetarders | FixedPose | ListedStates, Field(discriminator="kind")]
 
 
-class AutoExposure(_Part):
+class AutoExposure(FiniteSection):
     """Exposure found before the capture: the brightest states are probed first.
 
     The `percentile` of the pixels of the brightest state comes to `target` of full scale; no state saturates.
@@ -119,7 +116,7 @@ Seconds = Annotated[float, Tag("seconds")]
 Auto = Annotated[AutoExposure, Tag("auto")]
 
 
-class MeasurementPlan(_Part):
+class MeasurementPlan(FiniteSection):
     """One capture.
 
     Darks come first: the shutter is closed, the axes stand in the pose of the first state. `repeats` frames are

@@ -5,13 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-
-class Part(BaseModel):
-    """A section of a rig file: unknown keys and numbers that are not finite are refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+from processing.section import FiniteSection
 
 
 def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
@@ -24,7 +20,7 @@ def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
 Range = Annotated[tuple[float, float], AfterValidator(_ascending)]
 
 
-class ModeConfig(Part):
+class ModeConfig(FiniteSection):
     """How the rig measures in one mode.
 
     `pose_deg`: where axes stand that do not turn in this mode, one angle or one for each wavelength.
@@ -36,7 +32,7 @@ class ModeConfig(Part):
     )
 
 
-class ForbiddenPose(Part):
+class ForbiddenPose(FiniteSection):
     """A box of axis angles that the rig must neither stand in nor pass: all ranges hold at once."""
 
     why: str = Field(description="what would happen, for the message")
@@ -48,7 +44,7 @@ class ForbiddenPose(Part):
     )
 
 
-class HomingPath(Part):
+class HomingPath(FiniteSection):
     """What an axis may pass while it homes, from wherever it was left, and where it stands afterwards."""
 
     passes_deg: Range = Field(description="range that homing passes, degrees")
@@ -62,7 +58,7 @@ class HomingPath(Part):
         return self
 
 
-class InterlockConfig(Part):
+class InterlockConfig(FiniteSection):
     """A condition under which states count.
 
     `door`: the source's interlock circuit is closed. `temperature`: the camera is not warmer than `limit` degrees

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
-from acquisition.rig.parts import ForbiddenPose, HomingPath, InterlockConfig, ModeConfig, Part, Range
+from acquisition.rig.parts import ForbiddenPose, HomingPath, InterlockConfig, ModeConfig, Range
 from acquisition.rig.solids import Solids
 from acquisition.screen.notify import NotifyConfig
 from drivers.motion import AxisConfig
 from drivers.registry import Family, device_kinds
+from processing.section import FiniteSection
 from processing.storage.captures.schema import Detector
 from simulators.rig.model import SimulatorConfig
 
@@ -34,7 +35,7 @@ else:
     SourceEntry = _entry("sources")
 
 
-class RigSections(Part):
+class RigSections(FiniteSection):
     """A rig. Relative paths are relative to the rig file."""
 
     kind: Literal["rig"] = "rig"

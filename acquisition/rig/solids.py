@@ -11,13 +11,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from acquisition.rig.parts import Part
+from processing.section import FiniteSection
 
 Length = Annotated[float, Field(gt=0, le=10_000)]
 Coordinate = Annotated[float, Field(ge=-10_000, le=10_000)]
 
 
-class _Solid(Part):
+class _Solid(FiniteSection):
     name: str = Field(description="name that messages and other files use")
     centre_mm: tuple[Coordinate, Coordinate, Coordinate] = Field(description="centre from the centre of rotation, mm")
     turns_with: str | None = Field(default=None, description="axis that carries it; without one it stands still")
@@ -49,7 +49,7 @@ class Disc(_Solid):
 Solid = Annotated[Box | Cylinder | Disc, Field(discriminator="shape")]
 
 
-class Solids(Part):
+class Solids(FiniteSection):
     """Solids that must keep their distance from each other at every instant of every move."""
 
     margin_mm: float = Field(ge=0, le=1000, description="smallest distance allowed")

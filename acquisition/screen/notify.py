@@ -14,10 +14,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from acquisition.errors import as_known
 from acquisition.screen.observer import Observer
+from processing.section import Section
 
 log = logging.getLogger(__name__)
 
@@ -26,10 +27,8 @@ Event = Literal["end", "failure", "interlock"]
 PATIENCE_S = 10.0
 
 
-class NotifyConfig(BaseModel):
+class NotifyConfig(Section):
     """Section `notify` of a rig file: who hears of what."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     command: tuple[str, ...] = Field(
         default=(), description="command that is run with the message as its last argument and JSON on standard input"

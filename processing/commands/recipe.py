@@ -6,16 +6,14 @@ from pathlib import Path
 from typing import Literal
 
 import typer
-from pydantic import BaseModel, ConfigDict
 
+from processing.section import Section
 from processing.whole_file import write_whole_text
 from processing.yaml_file import dump_yaml, load_yaml
 
 
-class ImportRecipe(BaseModel):
+class ImportRecipe(Section):
     """Options of `process import` that describe how a lab writes its data; names as on the command line."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     wavelength_nm: float | None = None
     states: str | None = None

@@ -6,19 +6,18 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from processing.arrays import Array
+from processing.section import Section
 
 
-class Flat(BaseModel):
+class Flat(Section):
     """A rectangle through the centre of rotation.
 
     `normal_deg` is the azimuth of its normal from the camera's axis, positive towards the source;
     None lets it follow the arm and bisect source and camera (the specular pose).
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["flat"] = "flat"
     width_mm: float = Field(gt=0, description="width, mm")

@@ -9,12 +9,13 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from processing.arrays import Array
 from processing.computing.threads import for_ranges
 from processing.doors import one_line, require_file
 from processing.geometry.errors import GeometryError
+from processing.section import Section
 
 #: A million triangles as binary STL take 50 MB.
 MOST_MESH_BYTES = 256 << 20
@@ -22,14 +23,12 @@ MOST_MESH_BYTES = 256 << 20
 RAYS = 1 << 15
 
 
-class Mesh(BaseModel):
+class Mesh(Section):
     """An STL, OBJ or PLY file, scaled to mm, turned, then moved.
 
     `rotation_deg` is a rotation vector in the world frame; `translation_mm` moves the file's origin off the
     centre of rotation. A mesh with holes is refused unless `allow_holes`: rays would pass to its inside.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["mesh"] = "mesh"
     file: str = Field(description="file, relative to this one")

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from processing.arrays import Array
+from processing.section import Section
 
 
-class PinholeCamera(BaseModel):
+class PinholeCamera(Section):
     """A camera on the +z axis that looks at the centre of rotation; columns grow with +x, rows with -y.
 
     `centre_px` is (row, column) of the optical axis; None is the middle of the frame. `distortion` holds
     OpenCV's (k1, k2, p1, p2, k3).
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     rows: int = Field(gt=0, description="pixels from top to bottom")
     columns: int = Field(gt=0, description="pixels from left to right")

@@ -6,15 +6,14 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from processing.arrays import Array
+from processing.section import Section
 
 
-class Sphere(BaseModel):
+class Sphere(Section):
     """A sphere of known radius; `centre_mm` is its offset from the centre of rotation."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["sphere"] = "sphere"
     radius_mm: float = Field(gt=0, description="radius, mm")

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from processing.arrays import Array
 from processing.geometry.flat import Flat
@@ -14,12 +14,13 @@ from processing.geometry.frames import GeometryImage, ScatteringGeometry, dot, u
 from processing.geometry.mesh import Mesh
 from processing.geometry.pinhole import PinholeCamera
 from processing.geometry.sphere import Sphere
+from processing.section import Section
 from processing.yaml_file import load_yaml
 
 Shape = Annotated[Sphere | Flat | Mesh, Field(discriminator="kind")]
 
 
-class ViewingGeometry(BaseModel):
+class ViewingGeometry(Section):
     """Where camera, source and object stand. The source's distance is from the centre of rotation.
 
     `arm_zero_deg` is what has to be added to the arm's reading (`diagnose --reflectance` finds it).
@@ -30,8 +31,6 @@ class ViewingGeometry(BaseModel):
     >>> geometry.shape.radius_mm, geometry.source_distance_mm
     (12.7, 672.7)
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     camera: PinholeCamera = Field(description="pinhole camera")
     source_distance_mm: float = Field(gt=0, description="source to centre of rotation, mm")

@@ -7,12 +7,13 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from processing.arrays import Array
 from processing.errors import ProcessError
 from processing.instrument.changes import Changes
 from processing.polarization import mueller
+from processing.section import Section
 
 #: A number, or one number for each wavelength in nm.
 Dispersive = float | dict[float, float]
@@ -22,13 +23,7 @@ class WavelengthError(ProcessError):
     """The instrument model has no value for the wavelength asked for."""
 
 
-class Part(BaseModel):
-    """A section of an instrument file."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Uncertain(Part):
+class Uncertain(Section):
     """A number with its standard uncertainty, as a file may state it."""
 
     value: float = Field(description="the number")
@@ -42,7 +37,7 @@ Stated = Annotated[
 ]
 
 
-class Element(Part):
+class Element(Section):
     """One optical element, fixed or turned: azimuth = azimuth_deg + ratio * angle of `axis`."""
 
     name: str = Field(description="name that messages and other files use")

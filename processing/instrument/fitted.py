@@ -13,10 +13,10 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, field_serializer, field_validator
 
-from processing.instrument.elements import Part
+from processing.section import Section
 
 
-class EffectParameter(Part):
+class EffectParameter(Section):
     """A fitted value with its standard error (None: it has none, `note` says why); or one at each wavelength."""
 
     value: float | tuple[float, ...] = Field(description="fitted value")
@@ -38,7 +38,7 @@ class EffectParameter(Part):
         return f"{self.value:.{digits}f} ± {self.stderr:.{digits}f}"
 
 
-class AppliedEffect(Part):
+class AppliedEffect(Section):
     """One effect that `diagnose` found and added: what, where, how large, on which evidence."""
 
     kind: str
@@ -68,7 +68,7 @@ class AppliedEffect(Part):
 _AsWritten = dict[str, dict[str, float | str]]
 
 
-class SystematicError(Part):
+class SystematicError(Section):
     """What stays uncertain after a correction, as independent directions of one standard deviation each.
 
     Together they are the covariance of all values of the posterior, as far as a Mueller matrix notices it. Each

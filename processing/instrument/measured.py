@@ -11,13 +11,13 @@ from pydantic import Field, model_validator
 
 from processing.arrays import Array
 from processing.errors import ProcessError
-from processing.instrument.elements import Part
+from processing.section import Section
 
 #: The axis that tells states apart which have no angles.
 NUMBER = "state"
 
 
-class MeasuredMatrix(Part):
+class MeasuredMatrix(Section):
     """Rows of W at the states where they were measured; a capture is of these states, in any order."""
 
     angles_deg: dict[str, tuple[float, ...]] = Field(

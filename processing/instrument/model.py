@@ -16,7 +16,7 @@ from pydantic import Field, field_validator, model_validator
 
 from processing.arrays import Array
 from processing.instrument.changes import Changes
-from processing.instrument.elements import AnyElement, Part, Stated, number
+from processing.instrument.elements import AnyElement, Stated, number
 from processing.instrument.elements import Dispersive as Dispersive
 from processing.instrument.elements import Element as Element
 from processing.instrument.elements import Polarizer as Polarizer
@@ -27,6 +27,7 @@ from processing.instrument.fitted import EffectParameter as EffectParameter
 from processing.instrument.fitted import SystematicError as SystematicError
 from processing.instrument.measured import MeasuredMatrix
 from processing.instrument.stated import TRAINS, Correlation, without_u
+from processing.section import Section
 from processing.yaml_file import load_yaml
 
 #: What fitted values belong to: mounts and mechanics, the same in all captures; the detector, the same as long as its
@@ -35,7 +36,7 @@ from processing.yaml_file import load_yaml
 Belongs = Literal["mechanics", "detector", "dispersion", "wavelength", "capture"]
 
 
-class Channel(Part):
+class Channel(Section):
     """One detector channel: the elements that only its light passes, after the common analyzer train."""
 
     name: str = Field(description="name that messages and other files use")
@@ -52,7 +53,7 @@ class Channel(Part):
         return gain
 
 
-class InstrumentModel(Part):
+class InstrumentModel(Section):
     """Generator train, analyzer train and detector channels, in the order in which the light passes them.
 
     `mosaic`, for a division-of-focal-plane sensor, lays out the channel names over the super-pixel, row by

@@ -9,13 +9,13 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from processing.arrays import Array
-from processing.instrument.elements import Part
+from processing.section import Section
 
 #: Where a file has elements.
 TRAINS = ("generator", "analyzer", "channels", "elements")
 
 
-class Correlation(Part):
+class Correlation(Section):
     """Correlation of standard uncertainties, as `process calibrate --write` finds it.
 
     Attributes

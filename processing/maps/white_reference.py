@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from processing.arrays import Array
 from processing.doors import one_line, read_text
 from processing.errors import ProcessError
 from processing.geometry.frames import GeometryImage, dot
 from processing.geometry.viewing import ViewingGeometry
+from processing.section import FiniteSection
 from processing.storage.products.product import Product
 from processing.yaml_file import load_yaml
 
@@ -21,19 +22,15 @@ from processing.yaml_file import load_yaml
 SCALE = "absolute scale"
 
 
-class Certified(BaseModel):
+class Certified(FiniteSection):
     """Reflectance factor at one wavelength: radiance over that of a perfect diffuser, for unpolarized light."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     value: float = Field(gt=0, description="reflectance factor")
     u: float = Field(ge=0, description="its standard uncertainty, k = 1")
 
 
-class Certificate(BaseModel):
+class Certificate(FiniteSection):
     """What a calibration laboratory states of a white plaque."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     incidence_deg: float = Field(ge=0, lt=90, description="angle of incidence, degrees")
     viewing_deg: float = Field(ge=0, lt=90, description="viewing angle, degrees")

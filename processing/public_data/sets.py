@@ -7,9 +7,10 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, RootModel
+from pydantic import RootModel
 
 from processing.errors import ProcessError
+from processing.section import Section
 from processing.yaml_file import load_yaml
 
 HERE = Path(__file__).parent
@@ -21,11 +22,7 @@ SHIPPED = HERE.parents[1] / "tests" / "data"
 Progress = Callable[[int, int], None]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class SetFile(_Part):
+class SetFile(Section):
     """A file of a set.
 
     Attributes
@@ -51,7 +48,7 @@ class SetFile(_Part):
         return self.name or self.path.rpartition("/")[2]
 
 
-class PublicSet(_Part):
+class PublicSet(Section):
     """Public measured data: where they come from and what may be done with them.
 
     Attributes

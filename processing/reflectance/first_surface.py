@@ -7,27 +7,24 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from processing.arrays import Array, ComplexArray
 from processing.geometry.frames import ScatteringGeometry
 from processing.reflectance import fresnel
 from processing.reflectance.base import constants_at, normalized_mueller
+from processing.section import Section
 
 
-class Constants(BaseModel):
+class Constants(Section):
     """Complex refractive index ratio n + i k at one wavelength."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     n: float = Field(gt=0, description="refractive index")
     k: float = Field(default=0.0, ge=0, description="extinction coefficient")
 
 
-class Model(BaseModel):
+class Model(Section):
     """Fresnel reflection; the surface's normal plays no part."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["first_surface"] = "first_surface"
     name: str = Field(description="name that messages and other files use")

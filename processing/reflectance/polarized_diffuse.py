@@ -5,18 +5,17 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from processing.arrays import Array, ComplexArray
 from processing.geometry.frames import ScatteringGeometry
 from processing.reflectance import fresnel
 from processing.reflectance.base import constants_at, normalized_mueller
+from processing.section import Section
 
 
-class Constants(BaseModel):
+class Constants(Section):
     """The four constants of a material at one wavelength: n + i k, and the weight a sin^b(theta_h)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     n: float = Field(gt=0, description="refractive index")
     k: float = Field(default=0.0, ge=0, description="extinction coefficient")
@@ -34,10 +33,8 @@ def diffuse_jones(geometry: ScatteringGeometry) -> ComplexArray:
     return out
 
 
-class Model(BaseModel):
+class Model(Section):
     """J = F + a sin^b(theta_h) S."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["polarized_diffuse"] = "polarized_diffuse"
     name: str = Field(description="name that messages and other files use")

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from processing.arrays import Array, ComplexArray
 from processing.geometry.frames import ScatteringGeometry, cross, dot, unit
@@ -17,22 +17,19 @@ from processing.polarization import mueller
 from processing.polarization.cloude import xi0_and_dominant
 from processing.reflectance import fresnel
 from processing.reflectance.base import constants_at, normalized_mueller
+from processing.section import Section
 
 
-class Constants(BaseModel):
+class Constants(Section):
     """Constants of a material at one wavelength."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     n: float = Field(gt=1, description="refractive index")
     alpha: float = Field(gt=0, le=1, description="roughness: width of the distribution of facets (GGX)")
     albedo: float = Field(ge=0, le=1, description="part of the light in the volume that comes back")
 
 
-class Model(BaseModel):
+class Model(Section):
     """Sum of a rough first surface and of a depolarizing volume under it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["rough_plastic"] = "rough_plastic"
     name: str = Field(description="name that messages and other files use")

@@ -9,17 +9,16 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from processing.arrays import Array
 from processing.geometry.frames import ScatteringGeometry, dot
 from processing.polarization import mueller
+from processing.section import Section
 
 
-class Xi0Law(BaseModel):
+class Xi0Law(Section):
     """xi0 = base + lobe exp(-(theta_h/width)^2) + rise sin^2(theta_d): largest near specular and at grazing."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     base: float = Field(ge=0.25, le=1, description="value without the lobe")
     lobe: float = Field(default=0.0, ge=0, description="height of the specular lobe")
@@ -39,10 +38,8 @@ class Xi0Law(BaseModel):
         return np.asarray(self.base + self.lobe * lobe + self.rise * np.sin(td) ** 2)
 
 
-class M00Law(BaseModel):
+class M00Law(Section):
     """M00 = albedo cos(theta_i) + lobe exp(-(theta_h/width)^2), a fraction of a perfect white surface."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     albedo: float = Field(ge=0, le=1, description="throughput without the lobe")
     lobe: float = Field(default=0.0, ge=0, description="height of the specular lobe")

@@ -9,13 +9,14 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, RootModel
+from pydantic import Field, RootModel
 
 from processing.arrays import RealArray
 from processing.geometry.frames import GeometryImage
 from processing.geometry.viewing import ViewingGeometry
 from processing.polarization import mueller, triply_degenerate
 from processing.reflectance.base import ReflectanceModel, load_reflectance
+from processing.section import Section
 from processing.yaml_file import ConfigError, load_yaml
 from simulators.bench.scattering_laws import M00Law, Xi0Law, split_eigenvalues
 from simulators.bench.traced_surface import traced
@@ -30,11 +31,7 @@ class SceneError(ConfigError):
     """The scene cannot be seen as asked; the message says why and what to do."""
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Surface(_Part):
+class Surface(Section):
     """What the object's surface does at one wavelength.
 
     `eigenvalue_deviation` takes the three small coherency eigenvalues apart by up to this much, growing
@@ -48,7 +45,7 @@ class Surface(_Part):
     )
 
 
-class ObjectScene(_Part):
+class ObjectScene(Section):
     """An object with a reflectance model as its dominant process, before a background that reflects nothing.
 
     `material` is a file, relative to the scene's. `background_m00` is a perfectly depolarizing background.
@@ -62,7 +59,7 @@ class ObjectScene(_Part):
     background_m00: float = Field(default=0.0, ge=0, description="throughput beside the object")
 
 
-class AirScene(_Part):
+class AirScene(Section):
     """Nothing: M is the identity, seen where the source stands opposite to the camera (180 degrees)."""
 
     kind: Literal["air"]
@@ -70,7 +67,7 @@ class AirScene(_Part):
     throughput: float = Field(default=1.0, gt=0, le=1, description="factor on the light")
 
 
-class MirrorScene(_Part):
+class MirrorScene(Section):
     """An ideal flat mirror that fills the frame and turns with the arm: M = diag(1, 1, -1, -1)."""
 
     kind: Literal["mirror"]
@@ -78,7 +75,7 @@ class MirrorScene(_Part):
     throughput: float = Field(default=1.0, gt=0, le=1, description="factor on the light")
 
 
-class FlatScene(_Part):
+class FlatScene(Section):
     """An even white diffuser that fills the frame, for flat fields: it depolarizes perfectly, M = diag(1, 0, 0, 0)."""
 
     kind: Literal["flat"] = "flat"

@@ -9,9 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from drivers.pixel_formats import PIXEL_FORMATS, pixel_format
+from processing.section import Section
 from processing.yaml_file import ConfigError, load_yaml
 
 FOLDER = Path(__file__).parent / "node_maps"
@@ -20,10 +21,8 @@ Status = Literal["TriggerArmed", "ExposureActive", "FrameTriggerWait"]
 Range = tuple[float, float]
 
 
-class NodeMap(BaseModel):
+class NodeMap(Section):
     """The features of one camera model. Ranges are lowest and highest value."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     vendor: str = Field(max_length=31)
     model: str = Field(max_length=31)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from processing.section import Section
 from processing.storage.captures.schema import Detector
 from simulators.bench.bench import DARK_CURRENT_E_PER_S, DETECTOR
 from simulators.bench.effects import AnyBenchEffect
@@ -15,11 +16,7 @@ from simulators.camera.genicam.description_file import is_description
 SCHEME = "sim:"
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class SimulatedPort(_Part):
+class SimulatedPort(Section):
     """An emulated controller behind a pseudo-terminal; `faults` as in `simulate serve`, e.g. "garbled@12x1"."""
 
     kind: str
@@ -35,14 +32,14 @@ class SimulatedPort(_Part):
     )
 
 
-class SimulatedAxis(_Part):
+class SimulatedAxis(Section):
     """Where an axis of the rig is emulated: which port, and which axis of that controller, from 0."""
 
     port: str = Field(description="name of the emulated controller")
     index: int = Field(default=0, ge=0, description="which axis of that controller, from 0")
 
 
-class SimulatorConfig(_Part):
+class SimulatorConfig(Section):
     """What stands behind a simulated rig.
 
     `truth` names, for each mode, the instrument that the bench really has where it differs from the declared one;

@@ -5,19 +5,14 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
-
 from processing.diagnosis.search.rules import CHANCE_WORSE, FAR_OFF, LEAST_CHANGE
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
+from processing.section import Section
 
 Verdict = Literal["consistent", "explained", "partly_explained", "unexplained", "undetermined"]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class BeyondNoise(_Part):
+class BeyondNoise(Section):
     """The part of a residual that noise does not explain: rms of it, percent of the mean signal.
 
     Residual, noise and error have one unit: that of the counts as they were taken, whatever is corrected.
@@ -86,7 +81,7 @@ def _percent(value: float, stderr: float) -> str:
     return f"{value:.{digits}f}" + (f" ± {error} %" if float(error) > 0 else " %")
 
 
-class Error(_Part):
+class Error(Section):
     """Residual on data that the fit has not seen, for each degree of freedom; `held_out` says which data.
 
     `beyond_noise`: what of it noise does not explain; None where the noise is not known.
@@ -116,7 +111,7 @@ class Error(_Part):
         return f"{self.told} -> {after.told}" if explained is None else f"{self.told} ({explained} explained)"
 
 
-class FoundEffect(_Part):
+class FoundEffect(Section):
     """One effect with its values, the chi-square it explains on held-out data, and what else it could be.
 
     `probability` is that of this cause or one of those that it cannot be told from; `answer` says it in a word (sure,
@@ -157,7 +152,7 @@ class FoundEffect(_Part):
         )
 
 
-class Ranked(_Part):
+class Ranked(Section):
     """A candidate of the first round: chi-square gain on held-out data, and the residual it would leave."""
 
     candidate: str
@@ -165,7 +160,7 @@ class Ranked(_Part):
     rms_percent: float
 
 
-class Empirical(_Part):
+class Empirical(Section):
     """A correction that takes structure away without saying what it is. Not an explanation."""
 
     kind: str
@@ -176,7 +171,7 @@ class Empirical(_Part):
     note: str = "empirical: it describes what is left over in these captures and names no cause"
 
 
-class Unexplained(_Part):
+class Unexplained(Section):
     """What is left over, in words, and an empirical correction if one helps."""
 
     description: tuple[str, ...]
@@ -184,7 +179,7 @@ class Unexplained(_Part):
     empirical: Empirical | None
 
 
-class Check(_Part):
+class Check(Section):
     """One figure of the guard: it must not get worse by a correction."""
 
     name: str
@@ -208,7 +203,7 @@ class Check(_Part):
         return f"{self.before:.4g}", f"{self.after:.4g}"
 
 
-class Combination(_Part):
+class Combination(Section):
     """Values that are known together: sum of weight times value; `open_by` moves each of them and is not determined.
 
     The weight of the value whose unit it has is one.
@@ -226,7 +221,7 @@ def _not_less(size: float) -> str:
     return f"{size:.2g}" if size > LEAST_CHANGE else f"less than {LEAST_CHANGE:g}"
 
 
-class MuellerError(_Part):
+class MuellerError(Section):
     """How wrong M/m00 of these captures may still be, whatever the noise, with the instrument that would be written.
 
     Attributes
@@ -250,7 +245,7 @@ class MuellerError(_Part):
         )
 
 
-class Correction(_Part):
+class Correction(Section):
     """What would be written: means of the posterior, apart from names, and whether it may be used.
 
     Attributes
@@ -270,7 +265,7 @@ class Correction(_Part):
     refused: str | None = None
 
 
-class CaptureReport(_Part):
+class CaptureReport(Section):
     """One capture: what is known of it, and how far its residual is from noise, before and after.
 
     `error_before`, `error_after`: on held-out data, of this capture alone. `evidence`: what speaks against its frames,
@@ -297,7 +292,7 @@ class CaptureReport(_Part):
     closure_after_percent: float | None = None
 
 
-class NotMeasured(_Part):
+class NotMeasured(Section):
     """What of a capture is no measurement of the sample, and was left out.
 
     Attributes
@@ -332,14 +327,14 @@ class NotMeasured(_Part):
         return "; ".join(parts)
 
 
-class NoiseReport(_Part):
+class NoiseReport(Section):
     """What the noise is, and how it differs from what is declared, for each capture that it differs in."""
 
     verdict: Literal["as_declared", "not_as_declared", "estimated", "unknown"]
     told: tuple[str, ...] = ()
 
 
-class Diagnosis(_Part):
+class Diagnosis(Section):
     """Result of `diagnose`."""
 
     verdict: Verdict

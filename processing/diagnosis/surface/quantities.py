@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from processing.arrays import Array
 from processing.diagnosis.search.range_of import rank_of
@@ -12,17 +11,16 @@ from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import Pixels, SurfaceProblem
 from processing.polarization.cloude import xi0_and_dominant
 from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
+from processing.section import Section
 
 
-class Quantities(BaseModel):
+class Quantities(Section):
     """What the model says, one capture.
 
     `psi_deg` and `magnitude_percent` are root mean square differences between the modelled and the measured dominant
     process (a full Mueller capture only), the `noise` ones what they would be if the model were right: its intensities
     with noise drawn. `xi0` is the median, `unphysical` the part of the pixels whose xi0 is outside [1/4, 1].
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     psi_deg: float | None
     magnitude_percent: float | None

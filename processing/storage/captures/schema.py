@@ -13,9 +13,10 @@ from typing import Annotated, Any, Literal, Self
 import h5py
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from processing.doors import is_line
+from processing.section import FiniteSection
 from processing.storage.captures.nexus import (
     PIXEL_AXES,
     add_group,
@@ -80,10 +81,6 @@ EMPTY: dict[str, int] = {"repeats": 1, "crc32": -1}
 NOT_AXES = frozenset({"beam", "beam_light", "detector", "detector_camera", "omega", "omega_deg", "name"})
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
 def _line(text: str) -> str:
     if not is_line(text):
         raise ValueError("control characters in a text")
@@ -102,7 +99,7 @@ Line = Annotated[str, AfterValidator(_line)]
 Cell = Annotated[tuple[tuple[Line, ...], ...] | None, AfterValidator(_rectangular)]
 
 
-class Sample(_Part):
+class Sample(FiniteSection):
     """What stood at the centre. `mueller` (16 numbers, row-major) goes with kind "mueller".
 
     Air and mirror are known up to one throughput for each pixel.
@@ -121,7 +118,7 @@ class Sample(_Part):
         return self
 
 
-class Detector(_Part):
+class Detector(FiniteSection):
     """Noise-relevant constants of the detector; counts are right-aligned to `bits`.
 
     variance in counts^2 = (counts - black_level) / gain_e_per_count + (read_noise_e / gain_e_per_count)^2.
@@ -137,7 +134,7 @@ class Detector(_Part):
     bits: int | None = Field(default=None, ge=1, le=32, description="bits of a count; full scale is 2**bits - 1")
 
 
-class CaptureHeader(_Part):
+class CaptureHeader(FiniteSection):
     """Everything about a capture that is known before its first state."""
 
     title: Line
@@ -157,10 +154,10 @@ class CaptureHeader(_Part):
     rig_yaml: str = ""
     camera_settings_json: str = "{}"
     devices_json: str = "{}"
-    versions: dict[Line, Line] = {}
+    versions: dict[Line, Line] = Field(default_factory=dict)
     seed: int | None = Field(default=None, ge=0, lt=1 << 63)
     #: Axes whose targets were moved into their travel by whole multiples of so many degrees.
-    folded_deg: dict[str, float] = {}
+    folded_deg: dict[str, float] = Field(default_factory=dict)
     #: Every feature of the camera with its value when the capture began; in a note of its own, not in header_json.
     camera_nodes: dict[str, str] = Field(default={}, exclude=True)
     #: Colour before each pixel from the first of the frames on, for a sensor with a colour filter.

@@ -14,25 +14,25 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import Field
+
+from processing.section import Section
 
 
-class Identity(BaseModel):
+class Identity(Section):
     """What a run was made with, as digests (SHA-256) and as the devices told it.
 
     `files` are the files that rig and plan name, by their key; `devices` the properties of each device that must not
     change within a capture: kind, model, serial number, firmware.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     simulated: bool
     plan: str
     rig: str
     instrument: str
     software: str
-    files: dict[str, str] = {}
-    devices: dict[str, dict[str, str]] = {}
+    files: dict[str, str] = Field(default_factory=dict)
+    devices: dict[str, dict[str, str]] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from processing.arrays import Image
 from processing.instrument.model import InstrumentModel
+from processing.section import Section
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,8 @@ class Shot:
         return np.random.default_rng([self.seed, self.index + (1 << 31), zlib.crc32(name.encode())])
 
 
-class BenchEffect(BaseModel):
+class BenchEffect(Section):
     """Does nothing at any stage; an effect overrides the one it acts on."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     def angles(self, angles_deg: dict[str, float], shot: Shot) -> dict[str, float]:
         """Stage `train`: true angles of the optics in degrees."""
