@@ -27,7 +27,7 @@ from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument_file import WriteError, write_instrument
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
-from processing.public_data.conversion import StateTable, mirror_means, tables_of
+from processing.public_data.conversion import PublicStates, mirror_means, tables_of
 from processing.public_data.sets import SHIPPED, find_files
 from processing.steps.reduction import Reduction
 from processing.storage.captures.schema import Detector
@@ -276,7 +276,7 @@ def mirror_frames(folder: Path) -> Row:
 
 def _measured(
     instrument: str,
-    tables: tuple[StateTable, StateTable],
+    tables: tuple[PublicStates, PublicStates],
     folder: Path,
     truth: Callable[[dict[str, Array]], Array],
     *,

@@ -17,7 +17,7 @@ from processing.computing.threads import for_ranges
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.instrument.states import rotating_retarders
-from processing.reduction.counts_to_signal import BlockReader, Correction
+from processing.reduction.counts_to_signal import BlockReader, CountCorrection
 from processing.reduction.effects_of_capture import capture_changes
 from processing.reduction.measurement_matrix import field_of, measurement_matrix
 from processing.reduction.mueller import BLOCK_PIXELS
@@ -29,7 +29,7 @@ from processing.reduction.solvers.plain import MuellerSolver
 from processing.reduction.solvers.weighted import WeightedSolver
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import CaptureHeader, Detector, Sample
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, state_angles, write_capture
+from simulators.blind.undeclared_captures import TrueBench, TrueScene, digitize, expose, state_angles, write_capture
 
 ROOT = Path(__file__).resolve().parents[1]
 INSTRUMENT = ROOT / "configs/instruments/rgb950.yaml"
@@ -102,7 +102,7 @@ class OpenCapture:
         changes = capture_changes(self.capture, model, states)
         self.w = measurement_matrix(self.capture, model, states, changes).reshape(-1, 16)
         self.field = field_of(self.capture, model, states, changes)
-        reader = BlockReader(self.capture, states, Correction.of(self.capture))
+        reader = BlockReader(self.capture, states, CountCorrection.of(self.capture))
         noise = NoiseModel.of(self.capture.header.detector, integer=True)
         self.solver = MuellerSolver(Inversion.of(self.w), reader, noise)
 
@@ -219,11 +219,11 @@ def diagnose(folder: Path, target_ms: float, air: bool, moves: bool = False) -> 
 
     `moves`: the image circles by 0.6 pixel with the generator's retarder, too.
     """
-    bench, random = Bench(rows=SMALL[0], columns=SMALL[1], oa=np.deg2rad(13.41 + 0.05)), np.random.default_rng(1)
+    bench, random = TrueBench(rows=SMALL[0], columns=SMALL[1], oa=np.deg2rad(13.41 + 0.05)), np.random.default_rng(1)
     if moves:
         bench.shift.append(lambda k, a: (0.6 * np.cos(a["psg"]), 0.6 * np.sin(a["psg"])))
     angles = state_angles(40, False, False)
-    counts = digitize(bench, expose(bench, Scene(random, np.eye(4) if air else None), angles), random)
+    counts = digitize(bench, expose(bench, TrueScene(random, np.eye(4) if air else None), angles), random)
     sample = Sample(kind="air" if air else "unknown")
     path = folder / f"diagnose_{sample.kind}{'_moves' if moves else ''}.h5"
     write_capture(path, bench, counts, angles, sample=sample, instrument=INSTRUMENT.read_text(encoding="utf-8"))

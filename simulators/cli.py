@@ -44,7 +44,7 @@ def serve(
     seed: Annotated[int, typer.Option(help="of the garbled bytes")] = 0,
 ) -> None:
     """Serve an emulated controller until SIGTERM; the first line of output is the path of its port."""
-    from simulators.clock import Clock
+    from simulators.clock import FastClock
     from simulators.rig.controller_kinds import served_kinds
     from simulators.serial.reply_faults import FaultSchedule, parse_fault
     from simulators.serial.serve_options import ServeOptions
@@ -64,7 +64,7 @@ def serve(
         speed_deg_s=speed,
         acceleration_deg_s2=acceleration,
         homed=homed,
-        clock=Clock(clock_speed),
+        clock=FastClock(clock_speed),
         faults=FaultSchedule(faults, seed),
     )
     try:

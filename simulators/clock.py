@@ -91,7 +91,7 @@ def patient_clock() -> PatientClock:
     return clock
 
 
-class Clock:
+class FastClock:
     """Simulated time that runs `speed` times as fast as the clock it is based on.
 
     Parameters
@@ -122,7 +122,7 @@ class Clock:
             self.base.sleep_s(duration_s / self.speed)
 
 
-class ManualClock(Clock):
+class ManualClock(FastClock):
     """A clock that only moves when it is told to, for tests that look at one instant."""
 
     def __init__(self) -> None:

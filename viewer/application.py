@@ -13,7 +13,7 @@ from starlette.staticfiles import StaticFiles
 
 from processing.errors import ProcessError
 from viewer import alarms, browsing, comparing, following, frames, notes, probes, products, regions, starting, verdicts
-from viewer.guard import Guard
+from viewer.guard import PageGuard
 from viewer.library import Library, NotHere
 from viewer.pages import Pages, pages_of, whole_style
 
@@ -67,7 +67,7 @@ def application(folder: Path, token: str) -> Starlette:
     ]
     app = Starlette(
         routes=[Mount(f"/{token}", routes=routes)],
-        middleware=[Middleware(Guard, token=token)],
+        middleware=[Middleware(PageGuard, token=token)],
         exception_handlers={ProcessError: _refused},
     )
     app.state.pages = Pages(Library(folder), f"/{token}", f"/{token}/{PLOTLY.name}")

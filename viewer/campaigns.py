@@ -51,7 +51,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Block:
+class CampaignBlock:
     """Captures of one mode at one wavelength: a row for each sample, a column for each angle; references in a row."""
 
     mode: str
@@ -92,19 +92,19 @@ class CampaignView:
         """Captures that are complete."""
         return sum(cell.status in ("done", "flagged") for cell in self.cells)
 
-    def blocks(self) -> list[Block]:
+    def blocks(self) -> list[CampaignBlock]:
         """The grid, in the order in which it is taken."""
         keys = dict.fromkeys((cell.mode, cell.wavelength_nm) for cell in self.cells)
         return [self._block(*key) for key in keys]
 
-    def _block(self, mode: str, wavelength_nm: float) -> Block:
+    def _block(self, mode: str, wavelength_nm: float) -> CampaignBlock:
         cells = [c for c in self.cells if (c.mode, c.wavelength_nm) == (mode, wavelength_nm)]
         plain = [c for c in cells if not c.reference]
         angles = tuple(sorted({c.omega_deg for c in plain}))
         at = {(c.sample, c.omega_deg): c for c in plain}
         samples = dict.fromkeys(c.sample for c in plain)
         rows = tuple((sample, tuple(at.get((sample, angle)) for angle in angles)) for sample in samples)
-        return Block(mode, wavelength_nm, angles, rows, tuple(c for c in cells if c.reference))
+        return CampaignBlock(mode, wavelength_nm, angles, rows, tuple(c for c in cells if c.reference))
 
 
 def read_campaign(folder: Path, library: Library, running: str | None = None) -> CampaignView | None:

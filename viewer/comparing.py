@@ -15,7 +15,7 @@ from processing.maps.intervals import moves_of
 from processing.polarization.propagation import Derived
 from processing.reduction.noise import NoiseModel
 from processing.reduction.systematic import INPUTS, Systematic
-from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
+from processing.reports.colours import ALL, LIGHT, SIGNED, ColourScale, period_deg, scale_of, steps
 from processing.storage.captures.capture import Capture
 from processing.storage.products.images import MuellerImage, difference_errors, element_gradient
 from processing.storage.products.product import Product, is_lit, is_product
@@ -106,7 +106,7 @@ def difference(request: Request) -> Response:
             _same_shape(early.frame_shape, late.frame_shape)
             window = Window.asked(query, early.frame_shape, most=640)
             one, other = (capture_values(capture, query, window) for capture in (early, late))
-            name, units, scale = None, "counts", Scale(LIGHT, *_ends(one[0]))
+            name, units, scale = None, "counts", ColourScale(LIGHT, *_ends(one[0]))
     apart = one[0] - other[0]
     if (period := None if name is None else period_deg(name, units)) is not None:
         apart = (apart + period / 2) % period - period / 2
@@ -114,7 +114,7 @@ def difference(request: Request) -> Response:
     with np.errstate(divide="ignore", invalid="ignore"):
         over = apart / np.hypot(noise, systematic)
     wide = scale_of("deviation", "", apart)
-    scales = [scale, scale, wide, Scale(SIGNED, -ERRORS_SHOWN, ERRORS_SHOWN)]
+    scales = [scale, scale, wide, ColourScale(SIGNED, -ERRORS_SHOWN, ERRORS_SHOWN)]
     return sent(
         window,
         np.stack([one[0], other[0], apart, over]).astype(np.float32),

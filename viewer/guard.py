@@ -17,7 +17,7 @@ POLICY = (
 )
 
 
-class Guard:
+class PageGuard:
     """Refuses every request whose address lacks the token, or that another site has caused.
 
     Parameters

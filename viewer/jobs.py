@@ -39,7 +39,7 @@ OUTPUT_S = 10.0
 
 
 @dataclass(frozen=True)
-class Job:
+class PageJob:
     """One command that was started.
 
     Attributes
@@ -69,7 +69,7 @@ class Jobs:
     def __init__(self, root: Path) -> None:
         self._folder = root / OWN / "jobs"
 
-    def start(self, title: str, command: Sequence[str], about: dict[str, str], cwd: Path) -> Job:
+    def start(self, title: str, command: Sequence[str], about: dict[str, str], cwd: Path) -> PageJob:
         """Start a command of the console.
 
         Parameters
@@ -96,7 +96,7 @@ class Jobs:
                 # Ctrl-C for the application is not meant for a measurement that it has started.
                 start_new_session=True,
             )
-        job = Job(name, title, tuple(command), about, time.time(), process.pid, begun_ticks(process.pid))
+        job = PageJob(name, title, tuple(command), about, time.time(), process.pid, begun_ticks(process.pid))
         (folder / "job.json").write_text(json.dumps(asdict(job)), encoding="utf-8")
         threading.Thread(target=self._wait, args=(process, output, folder), name=f"job {name}", daemon=True).start()
         return job
@@ -110,16 +110,16 @@ class Jobs:
         with contextlib.suppress(OSError):
             (folder / "code").write_text(str(code), encoding="utf-8")
 
-    def job(self, name: str) -> Job:
+    def job(self, name: str) -> PageJob:
         """A job by its name. Raises NotHere."""
         path = self._folder / name / "job.json"
         # os.path.isfile, unlike Path.is_file, takes a name of any length.
         if "/" in name or "\0" in name or not os.path.isfile(path):
             raise NotHere(f"{name}: nothing of that name was started here")
         facts = read_json(path)
-        return Job(**{**facts, "command": tuple(facts["command"])})
+        return PageJob(**{**facts, "command": tuple(facts["command"])})
 
-    def all(self) -> list[Job]:
+    def all(self) -> list[PageJob]:
         """Every job, the newest first."""
         found = []
         for path in sorted(self._folder.glob("*/job.json"), reverse=True):
@@ -128,17 +128,17 @@ class Jobs:
                 found.append(self.job(path.parent.name))
         return found
 
-    def running(self, job: Job) -> bool:
+    def running(self, job: PageJob) -> bool:
         """Whether its process is still there."""
         return job.ticks is not None and begun_ticks(job.pid) == job.ticks
 
-    def code(self, job: Job) -> int | None:
+    def code(self, job: PageJob) -> int | None:
         """Its exit code; None while it runs, or where the application had ended before it did."""
         with contextlib.suppress(OSError, ValueError):
             return int((self._folder / job.name / "code").read_text(encoding="utf-8"))
         return None
 
-    def status(self, job: Job) -> str:
+    def status(self, job: PageJob) -> str:
         """running, done, stopped, failed or ended, which is: nobody was there to see how."""
         if self.running(job):
             return "running"
@@ -147,7 +147,7 @@ class Jobs:
             return "ended"
         return {0: "done", 130: "stopped"}.get(code, "failed")
 
-    def output(self, job: Job) -> str:
+    def output(self, job: PageJob) -> str:
         """What it has said, the end of it; of a bar that is redrawn the last state."""
         try:
             text = (self._folder / job.name / "output.txt").read_text(encoding="utf-8", errors="replace")
@@ -155,7 +155,7 @@ class Jobs:
             return ""
         return "\n".join(line.rsplit("\r", 1)[-1] for line in text[-SHOWN:].split("\n"))
 
-    def stop(self, job: Job) -> None:
+    def stop(self, job: PageJob) -> None:
         """Send it what Ctrl-C sends. Raises ProcessError if it has ended."""
         if not self.running(job):
             raise ProcessError(f"{job.title}: it has ended already")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.errors import ProcessError
-from processing.reduction.counts_to_signal import BlockReader, Correction
+from processing.reduction.counts_to_signal import BlockReader, CountCorrection
 from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import capture_changes, counts_correction
 from processing.reduction.instrument_of_capture import choose_model, require_one_colour
@@ -37,7 +37,7 @@ class SuperPixelReducer:
             self._model = model = choose_model(capture, instrument)
             self._states, _ = without_cut_off(capture, sample_states(capture))
             states, changes = self._states, capture_changes(capture, model, self._states)
-            self._counts, self._correction = counts_correction(changes, model), Correction.of(capture)
+            self._counts, self._correction = counts_correction(changes, model), CountCorrection.of(capture)
             self._noise = noise_of(capture, states)
             mosaic = capture.header.mosaic or model.mosaic or ()
             self._layout = MosaicLayout.of(mosaic, [channel.name for channel in model.channels])

@@ -36,7 +36,7 @@ class Note(Section):
         return " ".join((self.text, *self.tags)).lower()
 
 
-class _Kept(BaseModel):
+class _NotesFile(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     files: dict[str, Note] = {}
@@ -44,7 +44,7 @@ class _Kept(BaseModel):
 
 def notes_of(library: Library) -> dict[str, Note]:
     """Notes by the name of their file. Raises ProcessError for a damaged file."""
-    return read_kept(library, FILE, _Kept).files
+    return read_kept(library, FILE, _NotesFile).files
 
 
 async def write_note(request: Request) -> JSONResponse:
@@ -64,5 +64,5 @@ def _write_note(library: Library, asked: dict[str, str]) -> JSONResponse:
         files = notes_of(library) | {name: note}
         if note == Note():
             del files[name]
-        write_kept(library, FILE, _Kept(files=files))
+        write_kept(library, FILE, _NotesFile(files=files))
     return JSONResponse({"text": note.text, "tags": list(note.tags)})

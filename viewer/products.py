@@ -12,7 +12,7 @@ from starlette.responses import HTMLResponse, Response
 from processing.errors import ProcessError
 from processing.maps.stokes_vector import is_stokes_vector
 from processing.polarization import gradients
-from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
+from processing.reports.colours import ALL, LIGHT, SIGNED, ColourScale, period_deg, scale_of, steps
 from processing.reports.fact_words import fact_lines
 from processing.storage.products.product import COMPANIONS, Product, is_lit
 from processing.storage.products.provenance import steps_text
@@ -156,7 +156,7 @@ def named(opened: Product, query: Any) -> tuple[str, int]:
     return name, index
 
 
-def told(scale: Scale, units: str) -> dict[str, Any]:
+def told(scale: ColourScale, units: str) -> dict[str, Any]:
     """A scale and a unit, for the page."""
     return {"colours": scale.colours, "low": scale.low, "high": scale.high, "units": units_words(units)}
 
@@ -173,7 +173,9 @@ def mueller(request: Request) -> Response:
     return sent(window, elements, **facts)
 
 
-def read_mueller(opened: Product, window: Window, normalized: bool, errors: bool) -> tuple[NDArray[np.float32], Scale]:
+def read_mueller(
+    opened: Product, window: Window, normalized: bool, errors: bool
+) -> tuple[NDArray[np.float32], ColourScale]:
     """Elements (16, rows, columns) in a window and the scale of all but the first; NaN where it is too dark.
 
     The error of an element over m00 is its own over m00: that of m00 is left out, which is far smaller.
@@ -191,7 +193,7 @@ def read_mueller(opened: Product, window: Window, normalized: bool, errors: bool
     name = "mueller_errors" if errors else "mueller"
     scale = scale_of(name, "", shown[1:])
     if scale.colours == SIGNED and normalized:
-        scale = Scale(SIGNED, max(scale.low, -1.0), min(scale.high, 1.0))
+        scale = ColourScale(SIGNED, max(scale.low, -1.0), min(scale.high, 1.0))
     return shown, scale
 
 

@@ -64,7 +64,7 @@ class NamedRegion(Section):
         return region.reduced(self.image[0] // shape[0]) if self.image[0] % shape[0] == 0 else None
 
 
-class _Kept(BaseModel):
+class _RegionsFile(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     regions: list[NamedRegion] = []
@@ -72,7 +72,7 @@ class _Kept(BaseModel):
 
 def kept_regions(library: Library) -> list[NamedRegion]:
     """The regions of a folder, in the order in which they were named. Raises ProcessError for a damaged file."""
-    return read_kept(library, FILE, _Kept).regions
+    return read_kept(library, FILE, _RegionsFile).regions
 
 
 async def keep_region(request: Request) -> JSONResponse:
@@ -90,7 +90,7 @@ def _keep_region(library: Library, asked: dict[str, str]) -> JSONResponse:
     fresh = NamedRegion(name=name, columns=columns, rows=rows, image=shape)
     with _lock:
         by_name = {one.name: one for one in kept_regions(library)} | {name: fresh}
-        write_kept(library, FILE, _Kept(regions=list(by_name.values())))
+        write_kept(library, FILE, _RegionsFile(regions=list(by_name.values())))
     return JSONResponse({"name": name})
 
 
@@ -105,7 +105,7 @@ def _drop_region(library: Library, name: str) -> JSONResponse:
         kept = kept_regions(library)
         if all(one.name != name for one in kept):
             raise NotHere(f"{name}: there is no such region")
-        write_kept(library, FILE, _Kept(regions=[one for one in kept if one.name != name]))
+        write_kept(library, FILE, _RegionsFile(regions=[one for one in kept if one.name != name]))
     return JSONResponse({"name": name})
 
 

@@ -22,7 +22,7 @@ from processing.reflectance.base import kinds
 from processing.storage.captures.capture import Capture
 from viewer.diagnoses import Diagnoses
 from viewer.event_stream import event_stream
-from viewer.jobs import Job, Jobs
+from viewer.jobs import Jobs, PageJob
 from viewer.library import Library, NotHere
 from viewer.pages import Pages, fields_of, pages_of
 
@@ -43,7 +43,7 @@ async def start(request: Request) -> JSONResponse:
     return JSONResponse({"address": pages.address("job", name=job.name)})
 
 
-def _campaign(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
+def _campaign(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
     file = campaign_files(library).get(asked.get("file", ""))
     if file is None:
         raise NotHere(f"{asked.get('file')}: there is no such campaign file")
@@ -69,7 +69,7 @@ def campaign_files(library: Library) -> dict[str, Path]:
     }
 
 
-def _resume(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
+def _resume(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
     folder = library.path(asked.get("folder", ""))
     if read_identity(folder) is None:
         raise NotHere(f"{asked.get('folder')}: no campaign was begun in this folder")
@@ -109,7 +109,7 @@ def resumed_with(folder: Path) -> tuple[str, list[str]] | None:
     return shlex.join(command), [one if isinstance(one, str) else shlex.join(one) for one in named if one]
 
 
-def _reduce(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
+def _reduce(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
     capture = library.path(asked.get("file", ""))
     command = ["process", "reduce", str(capture)]
     if (file := _instrument(library, asked)) is not None:
@@ -119,20 +119,20 @@ def _reduce(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
     return jobs.start(f"reduce {capture.name}", command, {"file": library.name(capture)}, library.root)
 
 
-def _quantities(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
+def _quantities(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
     product = library.path(asked.get("file", ""))
     about = {"file": library.name(product)}
     return jobs.start(f"maps of {product.name}", ["process", "quantities", str(product)], about, library.root)
 
 
-def _diagnose(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
+def _diagnose(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
     captures = [library.path(name) for name in asked.get("files", "").split("\n") if name]
     name, folder = Diagnoses(library).begin(captures, _instrument(library, asked))
     more = ["--residuals", str(folder / "residuals.npz")]
     return _diagnosis(library, jobs, captures, name, folder=folder, more=more)
 
 
-def _surface(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
+def _surface(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
     captures = [library.path(name) for name in asked.get("files", "").split("\n") if name]
     material = _chosen(material_files(library), asked.get("material", ""), "material")
     geometry = _chosen(geometry_files(library), asked.get("geometry", ""), "geometry")
@@ -141,7 +141,9 @@ def _surface(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
     return _diagnosis(library, jobs, captures, name, folder=folder, more=more)
 
 
-def _diagnosis(library: Library, jobs: Jobs, captures: list[Path], name: str, *, folder: Path, more: list[str]) -> Job:
+def _diagnosis(
+    library: Library, jobs: Jobs, captures: list[Path], name: str, *, folder: Path, more: list[str]
+) -> PageJob:
     command = ["diagnose", *map(str, captures), "--instrument", str(folder / "instrument.yaml")]
     command += ["--json", str(folder / "diagnosis.json"), "--report", str(folder / "report.html"), *more]
     about = {"diagnosis": name, "file": library.name(captures[0])}
@@ -181,7 +183,7 @@ def _chosen(files: dict[str, Path], name: str, what: str) -> Path:
     return files[name]
 
 
-KINDS: dict[str, Callable[[Library, Jobs, dict[str, str]], Job]] = {
+KINDS: dict[str, Callable[[Library, Jobs, dict[str, str]], PageJob]] = {
     "campaign": _campaign,
     "resume": _resume,
     "reduce": _reduce,
@@ -198,7 +200,7 @@ def job(request: Request) -> HTMLResponse:
     return pages.draw("job.html", simulated=_simulated(pages, found), job=found, now=told(pages, jobs, found))
 
 
-def _simulated(pages: Pages, found: Job) -> bool:
+def _simulated(pages: Pages, found: PageJob) -> bool:
     """Whether the captures that a job reads, or the devices that it drives, are simulated."""
     if "file" in found.about:
         return pages.library.entry(found.about["file"]).simulated
@@ -209,7 +211,7 @@ def _simulated(pages: Pages, found: Job) -> bool:
         return False
 
 
-def told(pages: Pages, jobs: Jobs, found: Job) -> dict[str, Any]:
+def told(pages: Pages, jobs: Jobs, found: PageJob) -> dict[str, Any]:
     """What a page shows of a job: status, output, and where what it makes is shown."""
     status = jobs.status(found)
     links = []

@@ -28,7 +28,7 @@ from acquisition.rig.open_rig import open_rig
 from acquisition.rig.rig import Rig
 
 
-class Bench:
+class BlueskyBench:
     """An open rig and its devices; made by `open_bench`."""
 
     def __init__(self, rig: Rig, home: bool) -> None:
@@ -52,7 +52,7 @@ class Bench:
 
 
 @contextmanager
-def open_bench(rig_file: Path | str, home: bool = False) -> Iterator[Bench]:
+def open_bench(rig_file: Path | str, home: bool = False) -> Iterator[BlueskyBench]:
     """The devices of a rig, open until the end of the block.
 
     Parameters
@@ -63,7 +63,7 @@ def open_bench(rig_file: Path | str, home: bool = False) -> Iterator[Bench]:
     with open_rig(config) as rig:
         if (home or config.home_at_start) and (missing := rig.unhomed()):
             rig.home(missing)
-        bench = Bench(rig, home)
+        bench = BlueskyBench(rig, home)
         try:
             yield bench
         finally:

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from acquisition.bluesky_devices.device import Device, Readings, data_key, readings
+from acquisition.bluesky_devices.device import BlueskyDevice, Readings, data_key, readings
 from acquisition.bluesky_devices.frames_in_files import FRAME, Documents, asset_documents, in_file, write_frame
-from acquisition.bluesky_devices.status import Status, in_background
+from acquisition.bluesky_devices.status import MoveStatus, in_background
 from acquisition.errors import AcquisitionError
 
 
-class AxisDevice(Device):
+class AxisDevice(BlueskyDevice):
     """An axis of the rig; `set` goes to an angle in degrees, `read` tells where it is at rest."""
 
     @property
@@ -33,7 +33,7 @@ class AxisDevice(Device):
         who = self.rig.axes[self.name].describe()
         return {"serial_number": (who.serial_number, ""), "model": (who.model, "")}
 
-    def set(self, value: float) -> Status:
+    def set(self, value: float) -> MoveStatus:
         """Go to an angle, degrees. The status fails if it is forbidden, out of limits, or not reached."""
 
         def move() -> None:
@@ -56,7 +56,7 @@ class AxisDevice(Device):
         return {self.name: data_key(f"axis {self.name}, as read back", (), "degree")}
 
 
-class CameraDevice(Device):
+class CameraDevice(BlueskyDevice):
     """The camera; `trigger` takes a frame, `read` gives it with its mean. The light is on while it is staged.
 
     Attributes
@@ -99,7 +99,7 @@ class CameraDevice(Device):
         """Set the exposure of the next frames, as the camera takes it."""
         self.exposure_s = self.rig.set_exposure(exposure_s, 1).exposure_s or exposure_s
 
-    def stage(self) -> list[Device]:
+    def stage(self) -> list[BlueskyDevice]:
         """Set the exposure, let light through."""
         with self.turn:
             self.rig.show(self.sample)
@@ -108,7 +108,7 @@ class CameraDevice(Device):
                 self.rig.source.set_light(True)
         return [self]
 
-    def unstage(self) -> list[Device]:
+    def unstage(self) -> list[BlueskyDevice]:
         """Shut the light."""
         if self.rig.source is not None:
             self.rig.source.set_light(False)
@@ -119,7 +119,7 @@ class CameraDevice(Device):
         """What live tables show."""
         return {"fields": [f"{self.name}_mean"]}
 
-    def trigger(self) -> Status:
+    def trigger(self) -> MoveStatus:
         """Take one frame."""
 
         def expose() -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from acquisition.bluesky_devices.axis_and_camera import AxisDevice
-from acquisition.bluesky_devices.device import Device, Readings, data_key, readings
+from acquisition.bluesky_devices.device import BlueskyDevice, Readings, data_key, readings
 from acquisition.bluesky_devices.frames_in_files import Documents, asset_documents, in_file
 from acquisition.bluesky_devices.settings import SettingDevice
-from acquisition.bluesky_devices.status import Status, in_background
+from acquisition.bluesky_devices.status import MoveStatus, in_background
 from acquisition.capture import session
 from acquisition.capture.checks import refuse_failed
 from acquisition.capture.free_name import free_name
@@ -30,7 +30,7 @@ from processing.storage.captures.schema import COLUMN_UNITS
 COLUMNS = ("exposure_s", "host_time_s", "monitor", "saturated_fraction")
 
 
-class CaptureDevice(Device):
+class CaptureDevice(BlueskyDevice):
     """A whole capture: one `trigger` takes all its states into a file, and seals it.
 
     If the RunEngine pauses, the state that is being taken is finished and the light is shut; when it resumes, the same
@@ -65,10 +65,10 @@ class CaptureDevice(Device):
         self._stop = StopRequest()
         self._half: Path | None = None
         self._path: Path | None = None
-        self._taking: Status | None = None
+        self._taking: MoveStatus | None = None
         self._documents: list[tuple[str, dict[str, Any]]] = []
 
-    def trigger(self) -> Status:
+    def trigger(self) -> MoveStatus:
         """Take the capture, or what is missing of one that a pause has interrupted."""
         self._stop = StopRequest()
         self._taking = in_background(self._take)

@@ -11,7 +11,7 @@ from acquisition.rig.rig import Rig
 Readings = dict[str, dict[str, Any]]
 
 
-class Device:
+class BlueskyDevice:
     """What all have: a name, no parent, and a configuration that may be empty."""
 
     parent = None

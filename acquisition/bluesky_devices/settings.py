@@ -7,15 +7,15 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from acquisition.bluesky_devices.device import Device, Readings, data_key, readings
-from acquisition.bluesky_devices.status import Status, in_background
+from acquisition.bluesky_devices.device import BlueskyDevice, Readings, data_key, readings
+from acquisition.bluesky_devices.status import MoveStatus, in_background
 from acquisition.rig.rig import Rig
 
 #: How often a watched signal is read.
 _LOOK_S = 0.2
 
 
-class SettingDevice(Device):
+class SettingDevice(BlueskyDevice):
     """A number that a plan can scan, such as an exposure: `set` changes it, `read` gives it."""
 
     def __init__(
@@ -41,7 +41,7 @@ class SettingDevice(Device):
         """The value now."""
         return self._get()
 
-    def set(self, value: float) -> Status:
+    def set(self, value: float) -> MoveStatus:
         """Change it. The status fails with what refuses the value."""
 
         def change() -> None:
@@ -59,7 +59,7 @@ class SettingDevice(Device):
         return {self.name: data_key(f"setting {self.name}", (), self._unit)}
 
 
-class InterlockDevice(Device):
+class InterlockDevice(BlueskyDevice):
     """The interlock circuit of the source: 1 while it is open. A suspender can watch it.
 
     Callbacks get `value`, `timestamp` and `obj` by name, as those of ophyd do, whenever the value changes.

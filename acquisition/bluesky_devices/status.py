@@ -6,13 +6,13 @@ import threading
 from collections.abc import Callable
 
 
-class Status:
+class MoveStatus:
     """What the RunEngine waits for: done, with or without an error."""
 
     def __init__(self) -> None:
         self._ended = threading.Event()
         self._error: BaseException | None = None
-        self._callbacks: list[Callable[[Status], None]] = []
+        self._callbacks: list[Callable[[MoveStatus], None]] = []
         self._lock = threading.Lock()
 
     @property
@@ -31,7 +31,7 @@ class Status:
             raise TimeoutError("not done yet")
         return self._error
 
-    def add_callback(self, callback: Callable[[Status], None]) -> None:
+    def add_callback(self, callback: Callable[[MoveStatus], None]) -> None:
         """Have a function called at the end, at once if that has been."""
         with self._lock:
             if not self.done:
@@ -48,9 +48,9 @@ class Status:
             callback(self)
 
 
-def in_background(work: Callable[[], None]) -> Status:
+def in_background(work: Callable[[], None]) -> MoveStatus:
     """Do something in a thread of its own; its error becomes the status's."""
-    status = Status()
+    status = MoveStatus()
 
     def run() -> None:
         try:

@@ -15,7 +15,7 @@ from acquisition.campaign.identity import require_same_campaign, with_devices
 from acquisition.campaign.log import CampaignFolder, entry_of
 from acquisition.campaign.plan import Campaign, CampaignCapture, captures
 from acquisition.capture import session
-from acquisition.capture.checks import Check, refuse_failed
+from acquisition.capture.checks import CheckResult, refuse_failed
 from acquisition.capture.estimate import capture_seconds, last_pose_deg
 from acquisition.capture.identity import require_same
 from acquisition.capture.job import Job, Result, check_disc, check_with_devices, job_of
@@ -68,12 +68,14 @@ def prepare(campaign: Campaign, rig: RigConfig) -> list[tuple[CampaignCapture, J
     return jobs
 
 
-def check_all(jobs: Sequence[tuple[CampaignCapture, Job]], rig: Rig, folder: Path) -> tuple[list[Planned], list[Check]]:
+def check_all(
+    jobs: Sequence[tuple[CampaignCapture, Job]], rig: Rig, folder: Path
+) -> tuple[list[Planned], list[CheckResult]]:
     """Check every capture against the devices and the disc; nothing moves. Returns failures and passes alike."""
     planned = []
     pose: dict[str, float] = {}
     here = rig.where_once_homed()
-    seen: dict[tuple[str, str], Check] = {}
+    seen: dict[tuple[str, str], CheckResult] = {}
     for capture, job in jobs:
         table = unwound(folded(job.table, rig), rig, here)
         for check in check_with_devices(replace(job, table=table), rig, folder, here):

@@ -30,7 +30,7 @@ ReadInstrument: TypeAlias = Callable[[Path], InstrumentModel]
 
 
 @dataclass(frozen=True)
-class Check:
+class CheckResult:
     """One thing looked at: what, whether it is well, and in words what was found."""
 
     what: str
@@ -38,7 +38,7 @@ class Check:
     found: str
 
 
-def refuse_failed(checks: Sequence[Check]) -> None:
+def refuse_failed(checks: Sequence[CheckResult]) -> None:
     """Raise PlanRefused with every check that failed; nothing has moved by then."""
     failures = [f"{check.what}: {check.found}" for check in checks if not check.passed]
     if failures:
@@ -68,7 +68,7 @@ def standing_pose_deg(plan: MeasurementPlan, rig: RigConfig) -> dict[str, float]
     return pose
 
 
-def check_plan(plan: MeasurementPlan, rig: RigConfig) -> list[Check]:
+def check_plan(plan: MeasurementPlan, rig: RigConfig) -> list[CheckResult]:
     """What the files alone tell: mode, wavelength, axes, exposure, forbidden poses."""
     checks = [_member("mode", plan.mode, list(rig.modes))]
     known = [f"{w:g}" for w in rig.wavelengths_nm]
@@ -77,35 +77,37 @@ def check_plan(plan: MeasurementPlan, rig: RigConfig) -> list[Check]:
         checks.append(_member("sample", plan.sample.name or plan.sample.kind, sorted(rig.simulator.samples)))
     missing = sorted(set(plan.states.angles_deg()) - set(rig.axes))
     checks.append(
-        Check("axes", not missing, f"the rig has no axis {', '.join(missing)}" if missing else ", ".join(rig.axes))
+        CheckResult(
+            "axes", not missing, f"the rig has no axis {', '.join(missing)}" if missing else ", ".join(rig.axes)
+        )
     )
     if plan.sample.kind == "air" and abs(plan.omega_deg - 180) > 0.5:
-        checks.append(Check("sample", False, f"air needs omega 180 (straight through), not {plan.omega_deg:g}"))
+        checks.append(CheckResult("sample", False, f"air needs omega 180 (straight through), not {plan.omega_deg:g}"))
     if plan.darks and rig.source is None:
         found = f"{plan.darks} dark states, but the rig has no source that shuts off the light. "
-        checks.append(Check("darks", False, found + "Set darks to 0, or give the rig `source: {kind: manual}`"))
+        checks.append(CheckResult("darks", False, found + "Set darks to 0, or give the rig `source: {kind: manual}`"))
     low, high = rig.exposure_s
     if not isinstance(plan.exposure_s, AutoExposure):
         longest = plan.exposure_s * max(plan.bracket)
         fits = low <= plan.exposure_s * min(plan.bracket) and longest <= high
-        checks.append(Check("exposure", fits, f"{plan.exposure_s:g} s; the rig allows {low:g} to {high:g} s"))
+        checks.append(CheckResult("exposure", fits, f"{plan.exposure_s:g} s; the rig allows {low:g} to {high:g} s"))
     return checks
 
 
-def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) -> list[Check]:
+def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) -> list[CheckResult]:
     """Forbidden poses of every state and step, and whether the states determine a Mueller matrix."""
     for axis, column in table.angles_deg.items():
         if not np.all(np.abs(column) < NO_LIMIT_DEG):
             found = f"{column[np.argmin(np.abs(column) < NO_LIMIT_DEG)]:g} deg; no controller counts so far"
-            return [Check(f"angles of {axis}", False, found)]
+            return [CheckResult(f"angles of {axis}", False, found)]
     checks = _free_ways(rig, states_deg(table))
     lacking = [axis for axis in instrument.axes if axis not in table.angles_deg]
     if lacking:
         found = f"instrument {instrument.name!r} turns with {', '.join(lacking)}, the plan does not"
-        return [*checks, Check("instrument", False, found)]
+        return [*checks, CheckResult("instrument", False, found)]
     if len(instrument.channels) > 1 and instrument.mosaic is None and instrument.beams is None:
         found = f"{len(instrument.channels)} channels on one camera: the instrument file says by `beams` where they lie"
-        return [*checks, Check("instrument", False, found)]
+        return [*checks, CheckResult("instrument", False, found)]
     light = [k for k, role in enumerate(table.role) if role != "dark"]
     angles = {axis: table.angles_deg[axis][light] for axis in instrument.axes}
     # A mosaic before which nothing turns measures one linear Stokes vector.
@@ -119,24 +121,24 @@ def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) 
         if r < wanted:
             what = "a Mueller matrix" if wanted == 16 else "all that this instrument can"
             found += f": these states do not determine {what}. Change states, step_deg or ratio"
-        checks.append(Check("state table", r == wanted, found))
+        checks.append(CheckResult("state table", r == wanted, found))
     return checks
 
 
-def _free_ways(rig: RigConfig, poses: Sequence[Mapping[str, float]]) -> list[Check]:
+def _free_ways(rig: RigConfig, poses: Sequence[Mapping[str, float]]) -> list[CheckResult]:
     """From each state to the next, and from each to where a run that is stopped parks."""
     before: Mapping[str, float] = poses[0]
     for k, pose in enumerate(poses):
         found = find_obstacle(rig, before, pose)
         if found is not None:
-            return [Check("poses", False, f"state {k} meets {found}")]
+            return [CheckResult("poses", False, f"state {k} meets {found}")]
         before = pose
     solids = f", {len(rig.solids.parts)} solids" if rig.solids else ""
-    checks = [Check("poses", True, f"{len(poses)} states outside {len(rig.forbidden)} forbidden ranges{solids}")]
+    checks = [CheckResult("poses", True, f"{len(poses)} states outside {len(rig.forbidden)} forbidden ranges{solids}")]
     for k, pose in enumerate(poses if rig.park_deg else ()):
         found = find_obstacle(rig, pose, {**pose, **rig.park_deg}, rig.park_deg)
         if found is not None:
-            return [*checks, Check("way to the park pose", False, f"from state {k} it meets {found}")]
+            return [*checks, CheckResult("way to the park pose", False, f"from state {k} it meets {found}")]
     return checks
 
 
@@ -156,7 +158,7 @@ def load_instrument(plan: MeasurementPlan, rig: RigConfig, read: ReadInstrument)
 
 def check_devices(
     table: StateTable, rig: Rig, state: int = 0, here_deg: Mapping[str, float] | None = None
-) -> list[Check]:
+) -> list[CheckResult]:
     """Every target against the limits of the controllers, and the way to the state taken first; nothing moves.
 
     Parameters
@@ -169,32 +171,32 @@ def check_devices(
             for target in column:
                 rig.axes[axis].check(float(target))
         except LimitError as error:
-            checks.append(Check(f"limits of {axis}", False, str(error) + _could_fold(axis, rig)))
+            checks.append(CheckResult(f"limits of {axis}", False, str(error) + _could_fold(axis, rig)))
         else:
             ends = f"{column.min():g} to {column.max():g} deg"
-            checks.append(Check(f"limits of {axis}", True, ends))
+            checks.append(CheckResult(f"limits of {axis}", True, ends))
     checks.append(_check_first_move(table, rig, state, rig.where_once_homed() if here_deg is None else here_deg))
     checks += _check_park(rig)
     if rig.source is not None and rig.source.interlock_open():
-        checks.append(Check("door", False, "the interlock circuit of the source is open; close it"))
+        checks.append(CheckResult("door", False, "the interlock circuit of the source is open; close it"))
     return checks
 
 
-def _check_first_move(table: StateTable, rig: Rig, state: int, here_deg: Mapping[str, float]) -> Check:
+def _check_first_move(table: StateTable, rig: Rig, state: int, here_deg: Mapping[str, float]) -> CheckResult:
     by = states_deg(turned(table, turns_to(table, rig, state, here_deg, wanted={})))
     if find_way(rig.config, here_deg, by[state], by, limits=rig.limits, first=ARM) is None:
         found = find_obstacle(rig.config, here_deg, {**here_deg, **by[state]}, by[state], limits=rig.limits)
-        return Check("first move", False, f"to state {state} it meets {found}, and there is no way round it")
-    return Check("first move", True, f"free to state {state}")
+        return CheckResult("first move", False, f"to state {state} it meets {found}, and there is no way round it")
+    return CheckResult("first move", True, f"free to state {state}")
 
 
-def _check_park(rig: Rig) -> list[Check]:
+def _check_park(rig: Rig) -> list[CheckResult]:
     failures = []
     for name, angle in rig.config.park_deg.items():
         try:
             rig.axes[name].check(angle)
         except LimitError as error:
-            failures.append(Check(f"park_deg of {name}", False, str(error)))
+            failures.append(CheckResult(f"park_deg of {name}", False, str(error)))
     return failures
 
 
@@ -206,6 +208,6 @@ def _could_fold(axis: str, rig: Rig) -> str:
     )
 
 
-def _member(what: str, value: str, known: list[str]) -> Check:
+def _member(what: str, value: str, known: list[str]) -> CheckResult:
     there = value in known
-    return Check(what, there, value if there else f"{value!r} is not one of {', '.join(known)}")
+    return CheckResult(what, there, value if there else f"{value!r} is not one of {', '.join(known)}")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acquisition.capture.checks import (
-    Check,
+    CheckResult,
     ReadInstrument,
     check_devices,
     check_plan,
@@ -44,7 +44,7 @@ class Job:
     rig: RigConfig
     instrument: InstrumentModel
     table: StateTable
-    checks: tuple[Check, ...]
+    checks: tuple[CheckResult, ...]
     seed: int | None = None
     exposure_known: bool = True
     first: int = 0
@@ -86,7 +86,9 @@ def prepare(plan: MeasurementPlan, rig: RigConfig, read: ReadInstrument = Instru
     return Job(plan, rig, instrument, table, tuple(checks), seed, not isinstance(plan.exposure_s, AutoExposure))
 
 
-def check_with_devices(job: Job, rig: Rig, folder: Path, here_deg: Mapping[str, float] | None = None) -> list[Check]:
+def check_with_devices(
+    job: Job, rig: Rig, folder: Path, here_deg: Mapping[str, float] | None = None
+) -> list[CheckResult]:
     """Limits, door, exposure and disc, as the devices have them; nothing moves.
 
     Parameters
@@ -98,7 +100,7 @@ def check_with_devices(job: Job, rig: Rig, folder: Path, here_deg: Mapping[str, 
         settings = rig.set_exposure(float(exposure_s), job.plan.repeats)
         read_back_s = settings.exposure_s or float(exposure_s)
         close = abs(read_back_s - exposure_s) <= max(0.02 * exposure_s, 5e-5)
-        checks.append(Check("camera exposure", close, f"asked {exposure_s:g} s, read back {read_back_s:g} s"))
+        checks.append(CheckResult("camera exposure", close, f"asked {exposure_s:g} s, read back {read_back_s:g} s"))
     mosaic = _check_mosaic(job.instrument, rig)
     if job.instrument.mosaic is not None or not mosaic.passed:
         checks.append(mosaic)
@@ -109,13 +111,13 @@ def check_with_devices(job: Job, rig: Rig, folder: Path, here_deg: Mapping[str, 
     return [*checks, check_disc("disc", folder, needed)]
 
 
-def check_disc(what: str, folder: Path, needed: int) -> Check:
+def check_disc(what: str, folder: Path, needed: int) -> CheckResult:
     """Whether a folder has room for so many bytes."""
     try:
         on_disc(f"look at {folder}", _check_space_in, folder, needed)
     except AcquisitionError as error:
-        return Check(what, False, str(error))
-    return Check(what, True, f"{needed / 1e6:.0f} MB in {folder}")
+        return CheckResult(what, False, str(error))
+    return CheckResult(what, True, f"{needed / 1e6:.0f} MB in {folder}")
 
 
 def _check_space_in(folder: Path, needed: int) -> None:
@@ -125,20 +127,20 @@ def _check_space_in(folder: Path, needed: int) -> None:
     check_space(folder, needed)
 
 
-def _check_mosaic(instrument: InstrumentModel, rig: Rig) -> Check:
+def _check_mosaic(instrument: InstrumentModel, rig: Rig) -> CheckResult:
     try:
         mosaic = seen_by_camera(instrument, rig.require_camera()).mosaic or ()
     except AcquisitionError as error:
-        return Check("mosaic", False, str(error))
-    return Check("mosaic", True, "from the top left: " + " / ".join(" ".join(line) for line in mosaic))
+        return CheckResult("mosaic", False, str(error))
+    return CheckResult("mosaic", True, "from the top left: " + " / ".join(" ".join(line) for line in mosaic))
 
 
-def _check_beams(beams: tuple[str, ...], rows: int, columns: int) -> Check:
+def _check_beams(beams: tuple[str, ...], rows: int, columns: int) -> CheckResult:
     try:
         height, width = Beams(beams).shape((rows, columns))
     except ValueError as error:
-        return Check("beams", False, f"{error}. Change the camera's width")
-    return Check("beams", True, f"from the left: {', '.join(beams)}, {width} x {height} pixels each")
+        return CheckResult("beams", False, f"{error}. Change the camera's width")
+    return CheckResult("beams", True, f"from the left: {', '.join(beams)}, {width} x {height} pixels each")
 
 
 def job_of(path: Path, rig: RigConfig | None = None, plan: MeasurementPlan | None = None) -> Job:

@@ -9,14 +9,14 @@ import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from acquisition.capture.checks import Check
+from acquisition.capture.checks import CheckResult
 from acquisition.rig.config import RigConfig
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from simulators.bench.scene import Scene
 
 
-def check_machine(rig: RigConfig, samples: Iterable[str]) -> list[Check]:
+def check_machine(rig: RigConfig, samples: Iterable[str]) -> list[CheckResult]:
     """Programs of `alert` and `notify`, scenes of samples, and the instruments that an emulated bench truly is.
 
     Parameters
@@ -29,7 +29,7 @@ def check_machine(rig: RigConfig, samples: Iterable[str]) -> list[Check]:
         if command:
             found = shutil.which(command[0])
             lacking = f"there is no program {command[0]!r} here: nobody would be called"
-            checks.append(Check(key, found is not None, found or lacking))
+            checks.append(CheckResult(key, found is not None, found or lacking))
     if rig.simulator is not None:
         for name in dict.fromkeys(samples):
             if name in rig.simulator.samples:
@@ -39,9 +39,9 @@ def check_machine(rig: RigConfig, samples: Iterable[str]) -> list[Check]:
     return checks
 
 
-def _check_file(what: str, path: Path, load: Callable[[Path], object]) -> Check:
+def _check_file(what: str, path: Path, load: Callable[[Path], object]) -> CheckResult:
     try:
         load(path)
     except ProcessError as error:
-        return Check(what, False, str(error))
-    return Check(what, True, str(path))
+        return CheckResult(what, False, str(error))
+    return CheckResult(what, True, str(path))

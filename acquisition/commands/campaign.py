@@ -19,7 +19,7 @@ from acquisition.campaign.log import INDEX, LOG, CampaignFolder
 from acquisition.campaign.plan import Campaign
 from acquisition.campaign.run import CampaignRun, Planned
 from acquisition.campaign.summary import SUMMARY, summary_lines
-from acquisition.capture.checks import Check, refuse_failed
+from acquisition.capture.checks import CheckResult, refuse_failed
 from acquisition.capture.operator import Operator
 from acquisition.commands.defaults import DEFAULT_RIG, INTERRUPTED
 from acquisition.commands.single import Options, given_rig, live_page, say_simulated, seeded, show_checks
@@ -134,20 +134,20 @@ def _write_summary(folder: Path, names: Sequence[str], index: Mapping[str, Mappi
     return lines
 
 
-def _grouped(checks: Sequence[Check]) -> tuple[Check, ...]:
+def _grouped(checks: Sequence[CheckResult]) -> tuple[CheckResult, ...]:
     """What failed, and one line for each thing that passed, with its first and last finding."""
     passed: dict[str, list[str]] = {}
     for check in checks:
         if check.passed:
             passed.setdefault(check.what, []).append(check.found)
     lines = [
-        Check(what, True, found[0] if len(found) == 1 else f"{found[0]} ... {found[-1]} ({len(found)} different)")
+        CheckResult(what, True, found[0] if len(found) == 1 else f"{found[0]} ... {found[-1]} ({len(found)} different)")
         for what, found in passed.items()
     ]
     return (*(check for check in checks if not check.passed), *lines)
 
 
-def _show(planned: Sequence[Planned], checks: Sequence[Check], folder: Path) -> None:
+def _show(planned: Sequence[Planned], checks: Sequence[CheckResult], folder: Path) -> None:
     console = Console(soft_wrap=True)
     rows = [("", "capture", "states", "s", "MB", "")]
     for entry in planned:

@@ -15,7 +15,7 @@ import typer
 from rich.console import Console
 
 from acquisition.capture import session
-from acquisition.capture.checks import Check, refuse_failed
+from acquisition.capture.checks import CheckResult, refuse_failed
 from acquisition.capture.estimate import capture_seconds
 from acquisition.capture.free_name import free_name
 from acquisition.capture.header import default_name
@@ -242,7 +242,7 @@ def say_simulated(console: Console, rig: RigConfig) -> None:
         say(console, f"SIMULATED: rig {rig.name!r}, emulated devices, no hardware", "bold red")
 
 
-def show_checks(console: Console, checks: tuple[Check, ...]) -> None:
+def show_checks(console: Console, checks: tuple[CheckResult, ...]) -> None:
     """One line for each check."""
     print_rows((("ok" if check.passed else "REFUSED", check.what, check.found) for check in checks), console)
 

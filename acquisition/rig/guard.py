@@ -163,7 +163,7 @@ class Guard:
             while not (light.done() and axes.done()):
                 problem = self._axes_problem if light.done() else f"THE LIGHT IS NOT SHUT: {self._light_problem}"
                 if alarm is None and problem:
-                    alarm = Alarm(self, f"{why}. {problem}. The guard tries again")
+                    alarm = GuardAlarm(self, f"{why}. {problem}. The guard tries again")
                 if alarm is not None:
                     alarm.repeat()
                 self.journal.flush()
@@ -179,14 +179,14 @@ class Guard:
             self.call(text)
             self.journal.note("alarm acknowledged")
             return False
-        alarm = Alarm(self, text)
+        alarm = GuardAlarm(self, text)
         is_dark = light.result() is None
         while not alarm.is_acknowledged():
             # A lamp that burns on is worth every further try.
             if alarm.repeat() and not is_dark and self._try_light() is None:
                 is_dark = True
                 self.journal.note("light shut", why="tried again with the alarm")
-                alarm = Alarm(self, f"{text}. The light has been shut since")
+                alarm = GuardAlarm(self, f"{text}. The light has been shut since")
             self.journal.flush()
             time.sleep(LOOK_S)
         self.journal.note("alarm acknowledged")
@@ -261,7 +261,7 @@ class Guard:
             self.journal.note("ALERT FAILED", error=str(error), message=message)
 
 
-class Alarm:
+class GuardAlarm:
     """An alarm at the console and by the rig's command, again and again until somebody acknowledges it."""
 
     def __init__(self, guard: Guard, text: str) -> None:

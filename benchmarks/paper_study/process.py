@@ -12,7 +12,7 @@ from pathlib import Path
 from paper_study.acquire import BENCH, CONFIGS, SHOWN_DEG
 
 from processing.campaign.captures import find_captures
-from processing.campaign.run import Campaign, CampaignResult, compare_on_sphere
+from processing.campaign.run import CampaignResult, ProcessedCampaign, compare_on_sphere
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument_file import write_instrument
 from processing.diagnosis.search.result import Diagnosis
@@ -74,10 +74,10 @@ class FaultStudy:
 def study_sphere(captures: Path, out: Path, pool: Executor, say: Say) -> SphereStudy:
     """Reduce and compare everything, with less and less that is wrong."""
     say("sphere, as the files say")
-    as_told = Campaign(captures, out / "told", SPHERE, TABLE_I).run(pool)
+    as_told = ProcessedCampaign(captures, out / "told", SPHERE, TABLE_I).run(pool)
     _link_products(out / "told", out / "registered")
     say("sphere, found in the images")
-    registered = Campaign(captures, out / "registered", SPHERE, TABLE_I, register=True).run(pool)
+    registered = ProcessedCampaign(captures, out / "registered", SPHERE, TABLE_I, register=True).run(pool)
     geometries = {kind: out / f"geometry_{kind}.yaml" for kind in registered.views}
     for kind, path in geometries.items():
         path.write_text(dump_yaml(registered.views[kind]), encoding="utf-8")
@@ -85,7 +85,7 @@ def study_sphere(captures: Path, out: Path, pool: Executor, say: Say) -> SphereS
     fits = _fits(captures, out / "registered", geometries)
     _link_products(out / "told", out / "true_material")
     say("sphere, found in the images, with the material as it is")
-    true_material = Campaign(
+    true_material = ProcessedCampaign(
         captures, out / "true_material", geometries["mueller"], TRUE_MATERIAL, stokes_geometry=geometries["stokes"]
     ).run(pool)
     return SphereStudy(out / "told", as_told, registered, true_material, fits)
@@ -114,11 +114,11 @@ def study_body(captures: Path) -> dict[float, BodyProducts]:
 def study_fault(captures: Path, out: Path, healthy: SphereStudy, pool: Executor, *, say: Say) -> FaultStudy:
     """Compare as if nothing were wrong, ask `diagnose`, and compare again with the instrument file that it wrote."""
     say("sphere with the undeclared fault")
-    before = Campaign(captures, out / "before", SPHERE, TABLE_I).run(pool)
+    before = ProcessedCampaign(captures, out / "before", SPHERE, TABLE_I).run(pool)
     say("diagnose")
     found, instrument = _diagnosed(captures, out)
     say("sphere, corrected")
-    after = Campaign(captures, out / "after", SPHERE, TABLE_I, instrument=instrument).run(pool)
+    after = ProcessedCampaign(captures, out / "after", SPHERE, TABLE_I, instrument=instrument).run(pool)
     xi0 = {name: _xi0(result, healthy) for name, result in (("before", before), ("after", after))}
     return FaultStudy(before, after, found, xi0)
 

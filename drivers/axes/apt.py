@@ -32,7 +32,7 @@ PRM1_Z8_STAGE = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Scale:
+class StageScale:
     """Counts per degree, per degree/s and per degree/s^2."""
 
     position: float
@@ -41,14 +41,16 @@ class Scale:
 
 
 _KDC_CLOCK = 2048 / 6e6
-PRM1_Z8 = Scale(1919.6418578623391, 1919.6418578623391 * 65536 * _KDC_CLOCK, 1919.6418578623391 * 65536 * _KDC_CLOCK**2)
-K10CR1 = Scale(409600 / 3, 7329109.0, 1502.0)
+PRM1_Z8 = StageScale(
+    1919.6418578623391, 1919.6418578623391 * 65536 * _KDC_CLOCK, 1919.6418578623391 * 65536 * _KDC_CLOCK**2
+)
+K10CR1 = StageScale(409600 / 3, 7329109.0, 1502.0)
 
 
-def _brushless(counts_per_turn: int) -> Scale:
+def _brushless(counts_per_turn: int) -> StageScale:
     """Scale of a direct-drive stage: encoder counts, and the 102.4 us in which a brushless controller samples."""
     per_deg, sample_s = counts_per_turn / 360, 102.4e-6
-    return Scale(per_deg, per_deg * 65536 * sample_s, per_deg * 65536 * sample_s**2)
+    return StageScale(per_deg, per_deg * 65536 * sample_s, per_deg * 65536 * sample_s**2)
 
 
 STAGES = {"K10CR1": K10CR1, "PRM1-Z8": PRM1_Z8, "DDR25": _brushless(1_440_000), "DDR100": _brushless(3_276_800)}
@@ -145,7 +147,7 @@ class APTAxis(MotionAxis):
             address="0x50",
         )
 
-    def _find_scale(self, model: str, stage: int) -> Scale:
+    def _find_scale(self, model: str, stage: int) -> StageScale:
         if self.config.stage is not None:
             return STAGES[self.config.stage]
         if model.startswith("K10CR"):

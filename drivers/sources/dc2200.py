@@ -48,7 +48,7 @@ class Config(BaseModel):
         return self
 
 
-class LedDriver(LightSource):
+class Dc2200(LightSource):
     """A DC2200 in constant-brightness mode; at most one LED is on after a call of `select` or `set_light`."""
 
     selects_wavelength = True
@@ -176,11 +176,11 @@ class LedDriver(LightSource):
         raise ReplyTimeout(asked, f"no reply in {self.config.reply_s:g} s, twice", "Check power and cable")
 
 
-def open(config: Config, lines: LineRegistry) -> LedDriver:
+def open(config: Config, lines: LineRegistry) -> Dc2200:
     """Open the LED driver; asks who it is and changes nothing."""
     device = lines.take(config.port, MessageDevice, lambda _: MessageDevice(config.port, lines.clock, config.held_by))
     try:
-        return LedDriver(config, device, lines)
+        return Dc2200(config, device, lines)
     except BaseException:
         lines.release(config.port)
         raise

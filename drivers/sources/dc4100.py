@@ -63,7 +63,7 @@ class Config(BaseModel):
         return self
 
 
-class LedDriver(LightSource):
+class Dc4100(LightSource):
     """A DC4100 or DC4104. At most one LED is on after a call of `select` or `set_light`."""
 
     selects_wavelength = True
@@ -259,11 +259,11 @@ class LedDriver(LightSource):
         )
 
 
-def open(config: Config, lines: LineRegistry) -> LedDriver:
+def open(config: Config, lines: LineRegistry) -> Dc4100:
     """Open the LED driver; asks who it is and what it drives, and changes nothing."""
     link = lines.take(config.port, SerialLink, lambda transcript: _link(config, transcript, lines.clock))
     try:
-        return LedDriver(config, link, lines)
+        return Dc4100(config, link, lines)
     except BaseException:
         lines.release(config.port)
         raise

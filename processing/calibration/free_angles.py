@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from processing.arrays import Array
-from processing.calibration.state_design import Noise
+from processing.calibration.state_design import AssumedNoise
 from processing.computing.blas import one_blas_thread
 from processing.errors import ProcessError
 from processing.instrument.determined import DRAWN, determined_basis
@@ -43,7 +43,7 @@ class Goal:
         Rms of m_ij / m00 that the sample is expected to have, for `jitter_deg`.
     """
 
-    noise: Noise | None = None
+    noise: AssumedNoise | None = None
     jitter_deg: float = 0.0
     polarization: float = 0.3
 
@@ -125,7 +125,7 @@ class Cost:
 
     def _jitter(self, angles: Array, retardances: Array) -> Array:
         """Variance of the intensities by angles that scatter, over that of the noise."""
-        noise = self.goal.noise or Noise(20_000, 0)
+        noise = self.goal.noise or AssumedNoise(20_000, 0)
         size = np.deg2rad(self.goal.jitter_deg) * self.goal.polarization * np.sqrt(noise.electrons)
         total = np.zeros((self.states, 1))
         for k in range(len(self.axes)):

@@ -15,7 +15,7 @@ from processing.errors import ProcessError
 from processing.instrument.applied_effects import changes_at
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.flat import FEW
 from processing.reduction.measurement_matrix import relative_exposure
 from processing.reduction.sample_states import sample_states
@@ -46,7 +46,7 @@ def region_means(capture: Capture, rows: slice, columns: slice) -> tuple[NDArray
 
     States in which the region saturates are left out.
     """
-    correction = Correction.of(capture)
+    correction = CountCorrection.of(capture)
     black = correction.black
     means_of_dark = black.means if black.means.shape[2] == 1 else black.means[:, :, rows, columns]
     means, used = [], []
@@ -64,7 +64,7 @@ def region_means(capture: Capture, rows: slice, columns: slice) -> tuple[NDArray
 
 
 @dataclass(frozen=True)
-class Part:
+class KnownCapture:
     """One capture of a joint fit.
 
     Attributes
@@ -107,9 +107,9 @@ class Part:
         return np.asarray((data - shape * throughput).reshape(-1) / np.mean(data))
 
 
-def part_of(capture: Capture, model: InstrumentModel, rows: slice, columns: slice) -> Part:
+def part_of(capture: Capture, model: InstrumentModel, rows: slice, columns: slice) -> KnownCapture:
     """The region means of a capture of a known sample, for `fit_trains`; `model` is at its wavelength."""
     sample = known_mueller(capture.header.sample)
     signal, states = region_means(capture, rows, columns)
     angles = {name: values[states] for name, values in capture.angles_deg.items()}
-    return Part(model, angles, signal, sample, relative_exposure(capture, states), capture.header.wavelength_nm)
+    return KnownCapture(model, angles, signal, sample, relative_exposure(capture, states), capture.header.wavelength_nm)

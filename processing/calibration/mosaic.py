@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from processing.errors import NotDetermined, ProcessError
 from processing.instrument.model import InstrumentModel
-from processing.reduction.counts_to_signal import BlockReader, Correction
+from processing.reduction.counts_to_signal import BlockReader, CountCorrection
 from processing.reduction.measurement_matrix import relative_exposure
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.sample_states import sample_states
@@ -60,7 +60,7 @@ def fit_response(
             f"{capture.path}: {len(states)} states of the generator have rank {found} in "
             "(S0, S1, S2), and 3 are needed. Turn the polarizer to at least three different angles."
         )
-    reader = BlockReader(capture, states, Correction.of(capture))
+    reader = BlockReader(capture, states, CountCorrection.of(capture))
     inverse = np.linalg.pinv(light).astype(np.float32)
     rows, columns = capture.frame_shape
     response = np.empty((LINEAR, rows, columns), np.float32)

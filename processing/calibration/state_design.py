@@ -29,7 +29,7 @@ HOPELESS = 20.0
 
 
 @dataclass(frozen=True)
-class Noise:
+class AssumedNoise:
     """Detection noise of one intensity: read noise and the shot noise of a depolarizing sample.
 
     Attributes
@@ -74,7 +74,7 @@ class Score:
     element_stderr: Array
 
 
-def score(w: Array, noise: Noise, basis: Array | None = None, bound: float | None = None) -> Score:
+def score(w: Array, noise: AssumedNoise, basis: Array | None = None, bound: float | None = None) -> Score:
     """Score a measurement matrix (..., 16), rows kron(a, g) as `InstrumentModel.rows` gives them.
 
     `basis` (16, rank) and `bound` are those of the instrument (`free_angles`); default: all 16 elements.
@@ -190,7 +190,7 @@ def rows_of_design(
 
 def optimize(
     model: InstrumentModel,
-    noise: Noise,
+    noise: AssumedNoise,
     states: Sequence[int],
     free: Mapping[str, bool],
     *,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import approx_fprime, least_squares
 from scipy.special import fdtrc
 
-from processing.calibration.known_sample import CalibrationError, Part
+from processing.calibration.known_sample import CalibrationError, KnownCapture
 from processing.calibration.train_values import FITTABLE, TrainValues, checked_names, values_of, with_values
 from processing.calibration.wavenumber_curve import WavenumberCurve
 from processing.errors import NotDetermined
@@ -30,7 +30,7 @@ UNLIKELY = 1e-3
 MOST_TURNED = 5
 #: Parameter directions with a singular value below this, relative to the largest, are not determined.
 UNSEEN = 1e-7
-#: Part of a sensible step of a parameter over which derivatives are taken.
+#: KnownCapture of a sensible step of a parameter over which derivatives are taken.
 DIFFERENCE = 1e-6
 #: Least residual over the mean signal that a wavelength is weighted by: exact data would outweigh all others.
 LEAST_RESIDUAL = 1e-6
@@ -115,7 +115,7 @@ class CurveFit:
         )
 
 
-def fit_trains(parts: Sequence[Part], free: Sequence[str]) -> list[Calibration]:
+def fit_trains(parts: Sequence[KnownCapture], free: Sequence[str]) -> list[Calibration]:
     """Fit the free parameters to signals of known samples; the search starts from the values of the models.
 
     Parameters
@@ -140,7 +140,7 @@ def fit_trains(parts: Sequence[Part], free: Sequence[str]) -> list[Calibration]:
     return fit.calibrations(found)
 
 
-def fit_curves(parts: Sequence[Part], free: Sequence[str], coefficients: int) -> CurveFit:
+def fit_curves(parts: Sequence[KnownCapture], free: Sequence[str], coefficients: int) -> CurveFit:
     """`fit_trains`, where values of optics follow a polynomial in 1/wavelength over the parts' wavelengths.
 
     What `belongs_to` of the instrument declares as "wavelength" keeps a value of its own at each.
@@ -187,7 +187,7 @@ def fit_curves(parts: Sequence[Part], free: Sequence[str], coefficients: int) ->
 class _Fit:
     """The search over what some captures share."""
 
-    def __init__(self, parts: Sequence[Part], shared: TrainValues) -> None:
+    def __init__(self, parts: Sequence[KnownCapture], shared: TrainValues) -> None:
         self.parts, self.shared = parts, shared
         self.nominal = [values_of(part.model, shared.names) for part in parts]
         self._bases = [shared.base(values) for values in self.nominal]
@@ -299,7 +299,7 @@ class _Fit:
             )
         return out
 
-    def _derivative(self, part: Part, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _derivative(self, part: KnownCapture, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N * channels * pixels, K) of the residual by the values of a part."""
         names = self.shared.names
         small = DIFFERENCE * np.array([FITTABLE[name.rpartition(".")[2]][0] for name in names])
@@ -343,5 +343,5 @@ def _chance(found: Any, freedom: int, free_fit: Any, separate_freedom: int) -> f
     return float(fdtrc(held, separate_freedom, worse))
 
 
-def _wavelengths(parts: Sequence[Part]) -> list[float]:
+def _wavelengths(parts: Sequence[KnownCapture]) -> list[float]:
     return [part.wavelength_nm for part in parts]

@@ -89,7 +89,7 @@ class CampaignResult:
 
 
 @dataclass(frozen=True)
-class Campaign:
+class ProcessedCampaign:
     """`process campaign`: every capture of a folder reduced, and the two instruments and the model compared.
 
     Each capture is divided by the flat field of its camera and wavelength that was taken nearest in time, if the

@@ -60,7 +60,7 @@ def campaign_command(
     """
     from processing.campaign.curves import Curves
     from processing.campaign.executors import executor
-    from processing.campaign.run import Campaign
+    from processing.campaign.run import ProcessedCampaign
     from processing.commands.progress_bar import progress_bar
     from processing.errors import ProcessError
 
@@ -75,7 +75,9 @@ def campaign_command(
     target = out or folder / "campaign"
     taken = tuple(mode or ()), tuple(sample or ())
     if geometry is not None and material is not None:
-        step = Campaign(folder, target, geometry, material, stokes_geometry, registered, border, instrument, *taken)
+        step = ProcessedCampaign(
+            folder, target, geometry, material, stokes_geometry, registered, border, instrument, *taken
+        )
         with executor(workers, scheduler) as pool, progress_bar("campaign", "captures") as tick:
             result = step.run(pool, tick)
         _show_comparison(result, folder.name, target, with_paper)

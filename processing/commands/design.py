@@ -11,7 +11,7 @@ from processing.commands.purposes import CALIBRATION
 from processing.whole_file import write_new_text
 
 if TYPE_CHECKING:
-    from processing.calibration.state_design import Noise, Score
+    from processing.calibration.state_design import AssumedNoise, Score
     from processing.instrument.model import InstrumentModel
     from processing.instrument.states import StateTable
 
@@ -73,7 +73,7 @@ def design_command(
     if instrument is None:
         raise ProcessError("give an instrument file, for instance configs/instruments/rgb950.yaml (or --stokes)")
     from processing.calibration.free_angles import bound_of
-    from processing.calibration.state_design import Noise, score
+    from processing.calibration.state_design import AssumedNoise, score
     from processing.instrument.applied_effects import changes_at
     from processing.instrument.determined import determined_basis
     from processing.instrument.model import InstrumentModel
@@ -84,7 +84,7 @@ def design_command(
         raise ProcessError(f"{instrument} is given at {known} nm: choose one with --wavelength")
     nm = wavelength if wavelength is not None else (model.wavelengths_nm or (0.0,))[0]
     model = model.at(nm) if nm else model
-    noise = Noise(electrons, read_noise)
+    noise = AssumedNoise(electrons, read_noise)
     counts = _counts(states)
     if optimize is not None and "angles" in optimize:
         from processing.commands.loaded_late.design_angles import optimize_angles
@@ -162,7 +162,7 @@ def _given(
     return rotating_retarders(1.0, counts[0], step if step is not None else 360 / counts[0], ratio, axes=axes)
 
 
-def _optimized(model: InstrumentModel, noise: Noise, counts: list[int], free: str, ratio: float) -> StateTable:
+def _optimized(model: InstrumentModel, noise: AssumedNoise, counts: list[int], free: str, ratio: float) -> StateTable:
     from processing.calibration.state_design import optimize, two_retarders
     from processing.commands.progress_bar import progress_bar
     from processing.errors import ProcessError
@@ -182,7 +182,7 @@ def _optimized(model: InstrumentModel, noise: Noise, counts: list[int], free: st
     return designs[-1].table((str(generator.axis), str(analyzer.axis)))
 
 
-def _show(title: str, found: Score, noise: Noise) -> None:
+def _show(title: str, found: Score, noise: AssumedNoise) -> None:
     typer.echo(title)
     typer.echo(f"  rank {found.rank} of {found.wanted}, condition number {found.condition_number:.4g}")
     typer.echo(

@@ -17,7 +17,7 @@ EXACT_DEG = {0: 0.0, 23: 22.5, 45: 45.0, 68: 67.5, 90: 90.0, 113: 112.5, 135: 13
 
 
 @dataclass(frozen=True)
-class StateTable:
+class PublicStates:
     """States of one capture.
 
     Attributes
@@ -48,19 +48,19 @@ class StateTable:
         return path, False
 
 
-def tables_of(name: str, files: Files) -> list[StateTable]:
+def tables_of(name: str, files: Files) -> list[PublicStates]:
     """The captures of a set; empty where it holds no intensities."""
     return CONVERTERS[name](files) if name in CONVERTERS else []
 
 
-def _mosaics(files: Files) -> list[StateTable]:
+def _mosaics(files: Files) -> list[PublicStates]:
     return [
-        StateTable(name.split("_")[1], 550, "unknown", "state,file", (f"0,{path.resolve()}",))
+        PublicStates(name.split("_")[1], 550, "unknown", "state,file", (f"0,{path.resolve()}",))
         for name, path in files.items()
     ]
 
 
-def _imaging_630(files: Files) -> list[StateTable]:
+def _imaging_630(files: Files) -> list[PublicStates]:
     header = "state,analyzer_deg,psg_deg,psa_deg,file"
     folders = {"mirror": "Reflexion", "smileys": "Smileys"}
     found = []
@@ -71,11 +71,11 @@ def _imaging_630(files: Files) -> list[StateTable]:
             *analyzer, psg, psa = (int(part) for part in path.stem.split("_"))
             angles = f"{analyzer[0] if analyzer else 0},{EXACT_DEG[psg]},{EXACT_DEG[psa]}"
             rows.append(f"{k},{angles},{path.resolve()}")
-        found.append(StateTable(name, 630, "mirror" if name == "mirror" else "unknown", header, tuple(rows)))
+        found.append(PublicStates(name, 630, "mirror" if name == "mirror" else "unknown", header, tuple(rows)))
     return found
 
 
-def mirror_means(file: Path) -> StateTable:
+def mirror_means(file: Path) -> PublicStates:
     """The mirror frames of the imaging polarimeter as one mean each, of the table in tests/data."""
     with file.open(encoding="utf-8") as opened:
         rows = list(csv.DictReader(opened))
@@ -83,10 +83,12 @@ def mirror_means(file: Path) -> StateTable:
     for k, row in enumerate(rows):
         psg, psa = (EXACT_DEG[int(row[f"{end}_retarder_deg_nominal_rounded"])] for end in ("psg", "psa"))
         lines.append(f"{k},{psg},{psa},{row['psa_polarizer_deg']},{row['roi_mean_dn']}")
-    return StateTable("mirror_means", 630, "mirror", "state,psg_deg,psa_deg,analyzer_deg,channel_camera", tuple(lines))
+    return PublicStates(
+        "mirror_means", 630, "mirror", "state,psg_deg,psa_deg,analyzer_deg,channel_camera", tuple(lines)
+    )
 
 
-def _wollaston(files: Files) -> list[StateTable]:
+def _wollaston(files: Files) -> list[PublicStates]:
     found = []
     for name, local, prefix in (("air", "cal_results.json", "Cal_"), ("plate", "sample_results.json", "")):
         data = json.loads(files[local].read_text(encoding="utf-8"))
@@ -99,25 +101,25 @@ def _wollaston(files: Files) -> list[StateTable]:
             ]
             header = "state,psg_deg,channel_left,channel_right"
             sample = "air" if name == "air" else "unknown"
-            found.append(StateTable(f"{name}_{nm}nm", float(nm), sample, header, tuple(rows)))
+            found.append(PublicStates(f"{name}_{nm}nm", float(nm), sample, header, tuple(rows)))
     return found
 
 
-def single_detector(file: Path, wavelength_nm: float, beside: int = 0) -> StateTable:
+def single_detector(file: Path, wavelength_nm: float, beside: int = 0) -> PublicStates:
     """Air before one detector: the mean over `beside` rows of 2 nm on both sides of a wavelength."""
     lines = file.read_text(encoding="utf-8").replace(",", " ").splitlines()
     table = np.array([line.split() for line in lines if not line.startswith("wavelength")], dtype=float)
     at = int(np.argmin(np.abs(table[:, 0] - wavelength_nm)))
     means = table[at - beside : at + beside + 1, 1:].mean(axis=0)
     rows = tuple(f"{n},{6 * n},{30 * n},{float(v)!r}" for n, v in enumerate(means))
-    return StateTable(f"air_{wavelength_nm:g}nm", wavelength_nm, "air", "state,psg_deg,psa_deg,channel_camera", rows)
+    return PublicStates(f"air_{wavelength_nm:g}nm", wavelength_nm, "air", "state,psg_deg,psa_deg,channel_camera", rows)
 
 
-def _single_detector(files: Files) -> list[StateTable]:
+def _single_detector(files: Files) -> list[PublicStates]:
     return [single_detector(next(iter(files.values())), nm) for nm in range(450, 901, 50)]
 
 
-def _charis(files: Files) -> list[StateTable]:
+def _charis(files: Files) -> list[PublicStates]:
     by_wavelength: dict[int, list[str]] = {}
     for wavelength, hwp, rotator, left, right, stderr in _charis_rows(files.values()):
         rows = by_wavelength.setdefault(round(float(wavelength)), [])
@@ -125,7 +127,7 @@ def _charis(files: Files) -> list[StateTable]:
         sigma = float(stderr) / np.sqrt(2)
         rows.append(f"{len(rows)},{hwp},{rotator},{left},{right},{sigma}")
     header = "state,hwp_deg,image_rotator_deg,channel_left,channel_right,sigma"
-    return [StateTable(f"air_{nm}nm", nm, "air", header, tuple(rows)) for nm, rows in sorted(by_wavelength.items())]
+    return [PublicStates(f"air_{nm}nm", nm, "air", header, tuple(rows)) for nm, rows in sorted(by_wavelength.items())]
 
 
 def _charis_rows(paths: Iterable[Path]) -> list[Sequence[str]]:
@@ -142,7 +144,7 @@ def _charis_rows(paths: Iterable[Path]) -> list[Sequence[str]]:
     return found
 
 
-CONVERTERS: dict[str, Callable[[Files], list[StateTable]]] = {
+CONVERTERS: dict[str, Callable[[Files], list[PublicStates]]] = {
     "dofp-imx250mzr": _mosaics,
     "drr-imaging-630nm": _imaging_630,
     "drr-wollaston-nir": _wollaston,

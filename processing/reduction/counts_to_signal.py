@@ -19,7 +19,7 @@ from processing.storage.products.pixel_mask import Mask
 
 
 @dataclass(frozen=True)
-class Correction:
+class CountCorrection:
     """What is subtracted, divided out and left out.
 
     Attributes
@@ -46,7 +46,7 @@ class Correction:
         bad: NDArray[np.bool_] | None = None,
         dark_from: Capture | None = None,
         flat_from: Sequence[Capture] = (),
-    ) -> Correction:
+    ) -> CountCorrection:
         """What the capture offers: dark states, else the header's black level, else nothing (and says so).
 
         Parameters
@@ -144,7 +144,7 @@ class BlockReader:
         self,
         capture: Capture,
         states: NDArray[np.int64],
-        correction: Correction,
+        correction: CountCorrection,
         counts: CountsCorrection | None = None,
         *,
         struck: NDArray[np.int64] | None = None,

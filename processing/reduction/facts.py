@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.instrument.determined import determined_elements
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.inversion import Inversion
 from processing.storage.captures.capture import CaptureError
@@ -26,7 +26,7 @@ SOME_ROWS, SOME_PIXELS = 128, 1 << 17
 def mueller_facts(
     inversion: Inversion,
     noise: NoiseModel | None,
-    correction: Correction,
+    correction: CountCorrection,
     product: ProductWriter,
     *,
     states: int,

@@ -55,7 +55,7 @@ MIRRORS: dict[str, Callable[[Array], Array]] = {
 
 
 @dataclass(frozen=True)
-class Finding:
+class FrameFinding:
     """Something that a frame says against what was reported of it.
 
     Attributes
@@ -86,7 +86,7 @@ class FrameEvidence:
         # State, number and time of the frame before.
         self._last = (0, 0, 0)
         self._blocks: dict[int, Array] = {}
-        self.found: list[Finding] = []
+        self.found: list[FrameFinding] = []
 
     def repeats(self, pixels: NDArray[np.generic]) -> str | None:
         """Why a frame is one that came before, in words; None for a new one. Frames of one value are not judged."""
@@ -108,7 +108,7 @@ class FrameEvidence:
 
     def look(
         self, state: int, pixels: NDArray[np.generic], *, number: int, camera_ns: int, exposure_s: float, light: bool
-    ) -> list[Finding]:
+    ) -> list[FrameFinding]:
         """What is new to report of a frame that is kept.
 
         Parameters
@@ -122,12 +122,12 @@ class FrameEvidence:
             text = (
                 f"state {state} has the frame number {number} of state {before}: the camera does not count its frames"
             )
-            found.append(Finding(state, "number", text))
+            found.append(FrameFinding(state, "number", text))
         if camera_ns and last_ns and camera_ns <= last_ns:
             text = (
                 f"state {state}: the camera's clock stands or runs back, its time is not after that of state {before}"
             )
-            found.append(Finding(state, "time", text))
+            found.append(FrameFinding(state, "time", text))
         self._last = state, number, camera_ns
         if light and self._rows is not None:
             means = cv2.resize(np.asarray(pixels, dtype=np.float32), (BLOCKS, BLOCKS), interpolation=cv2.INTER_AREA)
@@ -141,7 +141,7 @@ class FrameEvidence:
         """The states taken so far are taken again."""
         self._blocks.clear()
 
-    def judge(self) -> list[Finding]:
+    def judge(self) -> list[FrameFinding]:
         """What all light states of the run together say; new findings alone."""
         if self._rows is None:
             return []
@@ -156,7 +156,7 @@ class FrameEvidence:
         return found
 
 
-def brightness_steps(states: NDArray[np.int64], rows: Array, light: Array) -> list[Finding]:
+def brightness_steps(states: NDArray[np.int64], rows: Array, light: Array) -> list[FrameFinding]:
     """States that are brighter or darker by one factor than the others say, alone or from one on.
 
     Parameters
@@ -165,7 +165,7 @@ def brightness_steps(states: NDArray[np.int64], rows: Array, light: Array) -> li
     rows : (N, 16) of the measurement matrix.
     light : (N,) mean light of the frames.
     """
-    found: list[Finding] = []
+    found: list[FrameFinding] = []
     keep = np.ones(len(states), dtype=bool)
     light = np.array(light, dtype=float)
     while len(found) < MOST_FOUND:
@@ -198,7 +198,7 @@ def brightness_steps(states: NDArray[np.int64], rows: Array, light: Array) -> li
         state = int(states[index[k]])
         where = f"from state {state} on" if onwards else f"state {state} alone"
         found.append(
-            Finding(
+            FrameFinding(
                 state,
                 "brightness",
                 f"{where}: the light is {factor:.3g} times what the other states say, and nothing in the plan changes "
@@ -227,7 +227,7 @@ def _drifts(outside: Array, y: Array, step: float) -> bool:
     return norm > 0 and float(left @ left) - float(left @ ramp) ** 2 / norm <= 2 * step
 
 
-def mirrored_pictures(states: NDArray[np.int64], rows: Array, blocks: Array) -> list[Finding]:
+def mirrored_pictures(states: NDArray[np.int64], rows: Array, blocks: Array) -> list[FrameFinding]:
     """All states from one on, or single ones, whose picture agrees with the others once it is mirrored.
 
     Parameters
@@ -242,7 +242,7 @@ def mirrored_pictures(states: NDArray[np.int64], rows: Array, blocks: Array) -> 
     if (step := _mirrored_from(outside, blocks)) is not None:
         k, words = step
         return [_mirrored(int(states[k]), f"from state {states[k]} on", words)]
-    found: list[Finding] = []
+    found: list[FrameFinding] = []
     blocks = blocks.copy()
     while len(found) < MOST_FOUND and (one := _mirrored_alone(rows, blocks)) is not None:
         k, words = one
@@ -253,8 +253,10 @@ def mirrored_pictures(states: NDArray[np.int64], rows: Array, blocks: Array) -> 
     return found
 
 
-def _mirrored(state: int, where: str, words: str) -> Finding:
-    return Finding(state, "picture", f"{where}: the picture is {words} against the other states: the camera changed")
+def _mirrored(state: int, where: str, words: str) -> FrameFinding:
+    return FrameFinding(
+        state, "picture", f"{where}: the picture is {words} against the other states: the camera changed"
+    )
 
 
 def _mirrored_from(outside: Array, blocks: Array) -> tuple[int, str] | None:
@@ -329,7 +331,7 @@ def evidence_of(capture: Capture) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*texts, *(f.text for f in found if (f.kind, f.state) not in kinds)]))
 
 
-def _identical(capture: Capture) -> list[Finding]:
+def _identical(capture: Capture) -> list[FrameFinding]:
     first: dict[bytes, int] = {}
     again: dict[int, list[int]] = {}
     for k, sums in enumerate(capture.row_sums()):
@@ -339,7 +341,7 @@ def _identical(capture: Capture) -> list[Finding]:
             if earlier != k:
                 again.setdefault(earlier, []).append(int(capture.done[k]))
     return [
-        Finding(
+        FrameFinding(
             states[0],
             "identical",
             f"{len(states)} states have the frame of state {capture.done[earlier]}, pixel by pixel, the first of them "
@@ -349,9 +351,9 @@ def _identical(capture: Capture) -> list[Finding]:
     ]
 
 
-def _numbers_again(capture: Capture) -> list[Finding]:
+def _numbers_again(capture: Capture) -> list[FrameFinding]:
     """Frame numbers and times of the camera's clock that two states of one run share."""
-    found: list[Finding] = []
+    found: list[FrameFinding] = []
     columns: tuple[tuple[Kind, str, str], ...] = (
         ("number", "frame_id", "frame number"),
         ("time", "camera_time_ns", "time of the camera's clock"),
@@ -364,11 +366,11 @@ def _numbers_again(capture: Capture) -> list[Finding]:
             if again.size:
                 state = int(capture.done[again[0]])
                 text = f"{again.size} states have the {what} of the state before, the first of them state {state}"
-                found.append(Finding(state, kind, text))
+                found.append(FrameFinding(state, kind, text))
     return found
 
 
-def _steps(capture: Capture) -> list[Finding]:
+def _steps(capture: Capture) -> list[FrameFinding]:
     """Steps of the brightness in each run, by the mean of each frame that `acquire` noted."""
     model, found = capture.instrument, []
     if model is None or not model.axes:

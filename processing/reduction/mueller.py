@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.instrument.model import InstrumentModel
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.effects_of_capture import references
 from processing.reduction.facts import mueller_facts
 from processing.reduction.left_out import Exclusions
@@ -37,7 +37,7 @@ def reduce_mueller(
     out: Path,
     steps: tuple[Step, ...],
     *,
-    correction: Correction | None = None,
+    correction: CountCorrection | None = None,
     choice: Choice | None = None,
     left_out: Exclusions | None = None,
     overwrite: bool = False,

@@ -14,7 +14,7 @@ from processing.errors import ProcessError
 from processing.instrument.determined import determined_basis, determined_elements
 from processing.instrument.model import InstrumentModel
 from processing.polarization.physical import nearest
-from processing.reduction.counts_to_signal import BlockReader, Correction
+from processing.reduction.counts_to_signal import BlockReader, CountCorrection
 from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import CountsCorrection, capture_changes, counts_correction
 from processing.reduction.facts import determined_words
@@ -124,7 +124,7 @@ class MuellerReduction:
     model: InstrumentModel
     states: NDArray[np.int64]
     warnings: tuple[str, ...]
-    correction: Correction
+    correction: CountCorrection
     counts: CountsCorrection | None
     struck: NDArray[np.int64]
     w: Array
@@ -141,7 +141,7 @@ class MuellerReduction:
         cls,
         capture: Capture,
         model: InstrumentModel,
-        correction: Correction | None = None,
+        correction: CountCorrection | None = None,
         choice: Choice | None = None,
         *,
         left_out: Exclusions | None = None,
@@ -152,7 +152,7 @@ class MuellerReduction:
         states, cut_off = without_cut_off(capture, left_out.rest_of(every, capture.path))
         warnings = (*left_out.warnings, *cut_off)
         changes = capture_changes(capture, model, states)
-        correction = correction or Correction.of(capture)
+        correction = correction or CountCorrection.of(capture)
         counts, struck = counts_correction(changes, model), _among(left_out.hits, every, states)
         basis = determined_basis(model)
         varies = changes is not None and bool(changes.field_retardance_rad)

@@ -13,7 +13,7 @@ from processing.instrument.applied_effects import changes_at
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
 from processing.polarization.magnitude import directions, interval
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import CountsCorrection, capture_changes, counts_correction, references
 from processing.reduction.facts import in_words
@@ -106,7 +106,7 @@ def reduce_stokes(
     steps: tuple[Step, ...],
     *,
     method: str = DEFAULT_METHOD,
-    correction: Correction | None = None,
+    correction: CountCorrection | None = None,
     noise: NoiseModel | None = None,
     response: NDArray[np.float32] | None = None,
     left_out: Exclusions | None = None,
@@ -135,7 +135,7 @@ def reduce_stokes(
     changes = capture_changes(capture, model, states)
     model_rows, analyzers = channel_rows(capture, model, states, changes)
     systematic = _systematic(capture, model, states)
-    correction = correction or Correction.of(capture)
+    correction = correction or CountCorrection.of(capture)
     noise = noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
     merged = merge(capture, states, correction, noise, counts=counts_correction(changes, model), progress=progress)
     frame = merged.signal
@@ -290,7 +290,7 @@ def _facts(
     found: dict[str, NDArray[Any]],
     analyzers: NDArray[np.float64],
     noise: NoiseModel | None,
-    correction: Correction,
+    correction: CountCorrection,
     *,
     method: str,
     states: int,

@@ -29,7 +29,7 @@ END_PERCENT = 99.5
 
 
 @dataclass(frozen=True)
-class Scale:
+class ColourScale:
     """Colours of a map and the values at their ends; what lies beyond an end is clipped."""
 
     colours: str
@@ -77,19 +77,19 @@ def upper_end(values: NDArray[np.floating]) -> float:
     return max(min(end, third + 3 * (third - first)) if third > first else end, 1e-30)
 
 
-def scale_of(name: str, units: str, values: NDArray[np.floating]) -> Scale:
+def scale_of(name: str, units: str, values: NDArray[np.floating]) -> ColourScale:
     """Colours and limits for a map: a period for orientations, symmetric about zero for signed quantities."""
     colours = colours_of(name, units)
     finite = values[np.isfinite(values)]
     low, high = np.percentile(finite, [100 - END_PERCENT, END_PERCENT]) if finite.size else (0.0, 1.0)
     if (period := period_deg(name, units)) is not None:
-        return Scale(colours, 0.0, period)
+        return ColourScale(colours, 0.0, period)
     if colours == SIGNED:
         most = max(abs(float(low)), abs(float(high)), 1e-6)
-        return Scale(colours, -most, most)
+        return ColourScale(colours, -most, most)
     if colours in (LIGHT, ERROR):
-        return Scale(colours, 0.0, max(float(high), 1e-6))
-    return Scale(colours, float(low), max(upper_end(finite), float(low) + 1e-6))
+        return ColourScale(colours, 0.0, max(float(high), 1e-6))
+    return ColourScale(colours, float(low), max(upper_end(finite), float(low) + 1e-6))
 
 
 @cache

@@ -9,7 +9,7 @@ from typing import Any
 
 from processing.calibration.photon_transfer import read_camera
 from processing.errors import ProcessError
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.flat import flat_captures, nearest_flat
 from processing.reduction.instrument_of_capture import choose_model
 from processing.reduction.left_out import Exclusions
@@ -117,7 +117,7 @@ class Reduction(FileStep):
             lost = left_out.bad if mueller else left_out.bad_or_struck(capture.frame_shape)
             if lost is not None:
                 bad = lost if bad is None else bad | lost
-            correction = Correction.of(capture, bad, dark, [opened(path) for path in flats])
+            correction = CountCorrection.of(capture, bad, dark, [opened(path) for path in flats])
             model = choose_model(capture, self.instrument)
             if mueller:
                 choice = Choice(self.weighted, self.covariance, self.physical, noise)

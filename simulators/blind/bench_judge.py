@@ -51,7 +51,7 @@ NAME = re.compile(r"(?P<kind>\w+)(?:\[(?P<place>[^\]]*)\])?")
 
 
 @dataclass(frozen=True)
-class Cause:
+class TrueCause:
     """One cause that `diagnose` tells.
 
     `certainty` is a word of `WORDS`; `probability` that one of the set is there; `right` says that the name is true,
@@ -75,7 +75,7 @@ class Matter:
 
 
 @dataclass(frozen=True)
-class Judgement:
+class BenchJudgement:
     """One bench, diagnosed from the captures `given`.
 
     Attributes
@@ -99,27 +99,27 @@ class Judgement:
     coverage_pixels: float
     coverage_patches: float
     written: bool
-    causes: tuple[Cause, ...] = ()
+    causes: tuple[TrueCause, ...] = ()
     matters: tuple[Matter, ...] = ()
-    wiring: tuple[Cause, ...] = ()
+    wiring: tuple[TrueCause, ...] = ()
     noise: str = ""
     left_out: tuple[Any, ...] = field(default=())
 
 
-def judgement_of(raw: Mapping[str, Any]) -> Judgement:
+def judgement_of(raw: Mapping[str, Any]) -> BenchJudgement:
     """A judgement from its JSON."""
-    return Judgement(
+    return BenchJudgement(
         **{
             **raw,
             "own": {name: (pair[0], pair[1]) for name, pair in raw["own"].items()},
-            "causes": tuple(Cause(**c) for c in raw["causes"]),
+            "causes": tuple(TrueCause(**c) for c in raw["causes"]),
             "matters": tuple(Matter(**m) for m in raw["matters"]),
-            "wiring": tuple(Cause(**c) for c in raw["wiring"]),
+            "wiring": tuple(TrueCause(**c) for c in raw["wiring"]),
         }
     )
 
 
-def names_of(result: Result, truth: RealBench, given: Sequence[str]) -> tuple[Cause, ...]:
+def names_of(result: Result, truth: RealBench, given: Sequence[str]) -> tuple[TrueCause, ...]:
     """Every cause of a result, compared with the faults that act in the captures given."""
     acting = active(truth, given)
     return tuple(_cause(e, acting) for e in result["effects"])
@@ -130,14 +130,14 @@ def active(truth: RealBench, given: Iterable[str]) -> list[TrueFault]:
     return [f for f in truth.faults if f.capture is None or f.capture in given]
 
 
-def _cause(effect: Mapping[str, Any], faults: Sequence[TrueFault]) -> Cause:
+def _cause(effect: Mapping[str, Any], faults: Sequence[TrueFault]) -> TrueCause:
     also = tuple(effect["indistinguishable_from"])
     certainty = _certainty(effect)
     probability = effect.get("probability")
     capture = effect.get("capture")
     name = f"{effect['kind']}[{effect['element'] or ''}]"
     right = _is_true(name, capture, faults)
-    return Cause(
+    return TrueCause(
         name + (f" in {capture}" if capture else ""),
         certainty,
         WORDS[certainty] if probability is None else float(probability),
@@ -191,10 +191,10 @@ def told_of(result: Result, truth: RealBench, given: Sequence[str]) -> tuple[Mat
     return tuple(out)
 
 
-def wiring_of(result: Result, truth: RealBench) -> tuple[Cause, ...]:
+def wiring_of(result: Result, truth: RealBench) -> tuple[TrueCause, ...]:
     """The mistake of wiring that is told, against the truth."""
     told = result.get("wiring")
     if not told:
         return ()
     right = any(WIRING_WORDS[f.kind] in told for f in truth.faults if f.kind in WIRING_WORDS)
-    return (Cause(told, "sure", WORDS["sure"], right, right),)
+    return (TrueCause(told, "sure", WORDS["sure"], right, right),)

@@ -14,14 +14,14 @@ import numpy as np
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument_file import write_instrument
 from processing.instrument.model import InstrumentModel
-from simulators.blind.bench_judge import GIVEN, Judgement, names_of, told_of, wiring_of
+from simulators.blind.bench_judge import GIVEN, BenchJudgement, names_of, told_of, wiring_of
 from simulators.blind.mueller_error import coverage_of, error_of
 from simulators.blind.real_bench import VALIDATION, RealBench
 
 
 def judge_bench(
     folder: Path, truth: RealBench, configs: Path, given: str = "joint"
-) -> tuple[Judgement, dict[str, Any]]:
+) -> tuple[BenchJudgement, dict[str, Any]]:
     """Diagnose the captures of one bench and judge the answer; also the result as `diagnose` writes it.
 
     Parameters
@@ -36,7 +36,7 @@ def judge_bench(
     seconds = time.perf_counter() - begun
     away = folder / "truth" / truth.name
     covered = coverage_of(away / f"{VALIDATION}_noisy.h5", corrected, _truth(away, VALIDATION))
-    judgement = Judgement(
+    judgement = BenchJudgement(
         name=truth.name,
         group=truth.group,
         given=given,

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from simulators.blind.bench_judge import Cause, Judgement
+from simulators.blind.bench_judge import BenchJudgement, TrueCause
 
 #: Errors of M / m00 below this are the rounding of counts, not the instrument.
 FLOOR = 2e-5
@@ -36,12 +36,12 @@ def is_worse(before: float, after: float) -> bool:
     return after > before + FLOOR
 
 
-def sure_and_wrong(j: Judgement) -> list[Cause]:
+def sure_and_wrong(j: BenchJudgement) -> list[TrueCause]:
     """Causes, of the bench or of its wiring, that are called sure and are not there."""
     return [c for c in (*j.causes, *j.wiring) if c.certainty == "sure" and not c.right]
 
 
-def reliability(judgements: Sequence[Judgement]) -> list[Bin]:
+def reliability(judgements: Sequence[BenchJudgement]) -> list[Bin]:
     """Told against true, by probability; a cause is true if it or another of its set is there."""
     causes = [c for j in judgements for c in j.causes if c.certainty != "unknown"]
     told = np.array([c.probability for c in causes])
@@ -59,11 +59,11 @@ def _share(values: Sequence[bool]) -> str:
     return f"{100 * float(np.mean(values)):.1f} % of {len(values)}" if values else "none"
 
 
-def _by(certainty: str, judgements: Sequence[Judgement], right: Callable[[Cause], bool]) -> str:
+def _by(certainty: str, judgements: Sequence[BenchJudgement], right: Callable[[TrueCause], bool]) -> str:
     return _share([right(c) for j in judgements for c in j.causes if c.certainty == certainty])
 
 
-def table(judgements: Sequence[Judgement]) -> str:
+def table(judgements: Sequence[BenchJudgement]) -> str:
     """The figures of one group and one choice of captures, as text."""
     crashed = [j for j in judgements if j.verdict.startswith("crashed")]
     seconds = [j.seconds for j in judgements]
@@ -77,7 +77,7 @@ def table(judgements: Sequence[Judgement]) -> str:
     return "\n".join(lines)
 
 
-def _matrix_lines(judgements: Sequence[Judgement]) -> list[str]:
+def _matrix_lines(judgements: Sequence[BenchJudgement]) -> list[str]:
     known = [j for j in judgements if np.isfinite(j.oracle)]
     lines = []
     for name in ("declared", "corrected", "oracle"):
@@ -100,7 +100,7 @@ def _matrix_lines(judgements: Sequence[Judgement]) -> list[str]:
     ]
 
 
-def _name_lines(judgements: Sequence[Judgement]) -> list[str]:
+def _name_lines(judgements: Sequence[BenchJudgement]) -> list[str]:
     told = [m.told for j in judgements for m in j.matters if m.size > MATTERS]
     lines = [
         f"called sure, and right: {_by('sure', judgements, lambda c: c.right)} (goal 99 %)",
@@ -124,7 +124,7 @@ def _name_lines(judgements: Sequence[Judgement]) -> list[str]:
     return lines
 
 
-def _line(j: Judgement) -> str:
+def _line(j: BenchJudgement) -> str:
     wrong = ", ".join(c.label for c in sure_and_wrong(j))
     missed = ", ".join(f"{m.label} {m.size:.1f}" for m in j.matters if m.size > MATTERS and m.told == "missed")
     return (

@@ -9,30 +9,30 @@ from __future__ import annotations
 import numpy as np
 
 from processing.arrays import Array
-from simulators.blind.undeclared_captures import Bench
+from simulators.blind.undeclared_captures import TrueBench
 from simulators.blind.undeclared_faults import Fault, Truth
 
 
-def read_noise_doubled(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def read_noise_doubled(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """Twice the read noise that is declared."""
     bench.declared["read_noise_e"] = bench.read_noise
     bench.read_noise *= 2
     return Truth("read_noise_doubled")
 
 
-def row_noise(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def row_noise(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """Every row of every frame has an offset of its own, 3 electrons rms."""
     bench.noise.append(lambda e, r: e + 3.0 * r.standard_normal((*e.shape[:2], 1)))
     return Truth("row_noise")
 
 
-def black_jitter(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def black_jitter(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """The black level of every frame is off by 3 electrons rms."""
     bench.noise.append(lambda e, r: e + 3.0 * r.standard_normal((e.shape[0], 1, 1)))
     return Truth("black_jitter")
 
 
-def uneven_steps(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def uneven_steps(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """The converter's steps are uneven: a pattern of 64 steps that is 4 counts off at most, the same everywhere."""
     off = np.cumsum(random.standard_normal(64))
     off -= np.linspace(off[0], off[-1], 64)
@@ -41,20 +41,20 @@ def uneven_steps(bench: Bench, random: np.random.Generator, states: int) -> Trut
     return Truth("uneven_steps")
 
 
-def gain_misstated(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def gain_misstated(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """The gain is declared 20 % too large or too small."""
     factor = float(random.choice([1.2, 1 / 1.2]))
     bench.declared["gain_e_per_count"] = bench.gain * factor
     return Truth("gain_misstated", "", {"declared_over_true": factor})
 
 
-def gain_not_stated(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def gain_not_stated(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """Nothing is declared of gain, read noise and full well."""
     bench.declared.update(gain_e_per_count=None, read_noise_e=None, full_well_e=None)
     return Truth("gain_not_stated")
 
 
-def resampled(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def resampled(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """Images were moved by a part of a pixel before they were stored: the noise of neighbours is alike."""
     x, y = random.uniform(0.3, 0.7, 2)
 
@@ -68,7 +68,7 @@ def resampled(bench: Bench, random: np.random.Generator, states: int) -> Truth:
     return Truth("resampled")
 
 
-def bad_frame(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def bad_frame(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """One frame belongs to nothing: the shutter was half closed, or the axis stood elsewhere."""
     bad, closed = int(random.integers(states)), bool(random.random() < 0.5)
     if closed:
@@ -80,7 +80,7 @@ def bad_frame(bench: Bench, random: np.random.Generator, states: int) -> Truth:
     return Truth("bad_frame", "", {"state": float(bad)})
 
 
-def cosmic_rays(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def cosmic_rays(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """Three tracks a frame, one to four pixels long, of 1000 to 10 000 electrons a pixel."""
 
     def strike(e: Array, r: np.random.Generator) -> Array:
@@ -97,7 +97,7 @@ def cosmic_rays(bench: Bench, random: np.random.Generator, states: int) -> Truth
     return Truth("cosmic_rays")
 
 
-def bad_pixels(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def bad_pixels(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """Three pixels of a thousand are stuck, hot and restless, or answer half."""
     kind = random.choice(4, size=(bench.rows, bench.columns), p=[0.997, 0.001, 0.001, 0.001])
 

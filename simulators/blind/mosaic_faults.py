@@ -5,28 +5,30 @@ from __future__ import annotations
 import numpy as np
 
 from processing.arrays import Array
-from simulators.blind.undeclared_captures import Bench
+from simulators.blind.undeclared_captures import TrueBench
 from simulators.blind.undeclared_faults import SizedFault, Sizes, Truth, draw_size
 
 
-def channel_gain(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.05)) -> Truth:
+def channel_gain(bench: TrueBench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.05)) -> Truth:
     bench.channel_gain = np.append(1.0, 1 + draw_size(random, *sizes) * random.standard_normal(3))
     names = ("channel_45", "channel_90", "channel_135")
     return Truth("channel_gain", "", dict(zip(names, (bench.channel_gain[1:] - 1).tolist(), strict=True)))
 
 
-def channel_azimuth(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.2, 2.0)) -> Truth:
+def channel_azimuth(bench: TrueBench, random: np.random.Generator, states: int, sizes: Sizes = (0.2, 2.0)) -> Truth:
     degrees = draw_size(random, *sizes) * random.standard_normal(4)
     bench.channel_azimuth = np.deg2rad(degrees)
     return Truth("channel_azimuth")
 
 
-def channel_extinction(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.04)) -> Truth:
+def channel_extinction(
+    bench: TrueBench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.04)
+) -> Truth:
     bench.channel_extinction = draw_size(random, *sizes) * random.uniform(0.2, 1.8, 4)
     return Truth("channel_extinction")
 
 
-def pixel_crosstalk(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.01, 0.1)) -> Truth:
+def pixel_crosstalk(bench: TrueBench, random: np.random.Generator, states: int, sizes: Sizes = (0.01, 0.1)) -> Truth:
     size = draw_size(random, *sizes)
 
     def spread(k: int, e: Array) -> Array:

@@ -1,6 +1,6 @@
 """More faults that `processing/instrument/effects` does not know, by physics, at sizes of a lab.
 
-The first nine are in `undeclared_faults.UNLISTED`. Each changes a Bench and says what it did.
+The first nine are in `undeclared_faults.UNLISTED`. Each changes a TrueBench and says what it did.
 """
 
 from __future__ import annotations
@@ -9,23 +9,23 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from processing.arrays import Array
-from simulators.blind.undeclared_captures import Bench
+from simulators.blind.undeclared_captures import TrueBench
 from simulators.blind.undeclared_faults import Fault, Truth, draw_axis, draw_signed, draw_size
 
 
-def _grid(bench: Bench) -> tuple[Array, Array]:
+def _grid(bench: TrueBench) -> tuple[Array, Array]:
     """Rows and columns of all pixels."""
     y, x = np.mgrid[0 : bench.rows, 0 : bench.columns].astype(float)
     return y, x
 
 
-def _spot(bench: Bench, random: np.random.Generator, low: float, high: float) -> tuple[float, float, float]:
+def _spot(bench: TrueBench, random: np.random.Generator, low: float, high: float) -> tuple[float, float, float]:
     """Centre (row, column) and radius of a spot, the radius between two shares of the image width."""
     y, x = random.uniform(0.25, 0.75, 2) * (bench.rows, bench.columns)
     return float(y), float(x), float(random.uniform(low, high) * bench.columns)
 
 
-def drifting_spot(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def drifting_spot(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """A part of the sample is lit by a lamp of its own, which drifts."""
     y, x = _grid(bench)
     y0, x0, radius = _spot(bench, random, 0.1, 0.3)
@@ -35,21 +35,21 @@ def drifting_spot(bench: Bench, random: np.random.Generator, states: int) -> Tru
     return Truth("drifting_spot")
 
 
-def image_lag(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def image_lag(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """A part of the charge of a frame is read with the next one."""
     size = draw_size(random, 0.003, 0.02)
     bench.transfer.append(lambda e: (1 - size) * e + size * np.concatenate([e[:1], e[:-1]]))
     return Truth("image_lag")
 
 
-def lamp_jump(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def lamp_jump(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """The lamp's arc jumps to another place and stays there. In truth a gain for each state."""
     size, first = draw_signed(random, 0.003, 0.03), int(random.integers(5, states - 5))
     bench.level.append(lambda k, a: 1 + size * (k >= first))
     return Truth("lamp_jump")
 
 
-def focus_breathing(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def focus_breathing(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """The magnification follows the turning plate, whose faces are not flat."""
     axis, size, phase = draw_axis(bench, random), draw_size(random, 0.002, 0.015), random.uniform(0, 2 * np.pi)
     y, x = _grid(bench)
@@ -63,7 +63,7 @@ def focus_breathing(bench: Bench, random: np.random.Generator, states: int) -> T
     return Truth("focus_breathing")
 
 
-def ghost(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def ghost(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """Light that is reflected twice in a turning plate with a wedge: a weak second image, which goes round."""
     size, radius, phase = draw_size(random, 0.005, 0.03), random.uniform(2, 8), random.uniform(0, 2 * np.pi)
     y, x = _grid(bench)
@@ -77,7 +77,7 @@ def ghost(bench: Bench, random: np.random.Generator, states: int) -> Truth:
     return Truth("ghost")
 
 
-def tilted_plate(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def tilted_plate(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """A plate that is tilted in its mount: its retardance goes once up and down in half a turn."""
     axis, size, phase = draw_axis(bench, random), np.deg2rad(draw_size(random, 0.2, 2.0)), random.uniform(0, 2 * np.pi)
     turn = 2 * np.pi / states * (1 if axis == "psg" else 4.91)
@@ -90,7 +90,7 @@ def tilted_plate(bench: Bench, random: np.random.Generator, states: int) -> Trut
     return Truth("tilted_plate")
 
 
-def turning_shadow(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def turning_shadow(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """Dust on a turning plate that is nearly in focus."""
     depth, radius, phase = draw_size(random, 0.01, 0.1), random.uniform(0.08, 0.2), random.uniform(0, 2 * np.pi)
     y, x = _grid(bench)
@@ -105,7 +105,7 @@ def turning_shadow(bench: Bench, random: np.random.Generator, states: int) -> Tr
     return Truth("turning_shadow")
 
 
-def rolling_rows(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def rolling_rows(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """Rows are exposed one after the other under a lamp that ripples, and the ripple is not in step with the frames."""
     size, periods = draw_size(random, 0.003, 0.02), random.uniform(1.3, 5)
     phase = random.uniform(0, 2 * np.pi, states)
@@ -114,7 +114,7 @@ def rolling_rows(bench: Bench, random: np.random.Generator, states: int) -> Trut
     return Truth("rolling_rows")
 
 
-def bubbles(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def bubbles(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """Small bubbles rise through a cell of liquid in front of the sample."""
     y, x = _grid(bench)
     start = random.uniform(0, 1, (4, 2)) * (bench.rows, bench.columns)
@@ -130,14 +130,14 @@ def bubbles(bench: Bench, random: np.random.Generator, states: int) -> Truth:
     return Truth("bubbles")
 
 
-def stage_drift(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def stage_drift(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """The sample's stage turns slowly about the line of sight: the image turns, and its polarization with it."""
     size = np.deg2rad(draw_signed(random, 0.1, 1.5))
     bench.turned.append(lambda k: float(size * (k / (states - 1) - 0.5)))
     return Truth("stage_drift")
 
 
-def breathing_blur(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def breathing_blur(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """The image gets sharper and softer as a plate turns."""
     size, phase = random.uniform(0.4, 1.2), random.uniform(0, 2 * np.pi)
 

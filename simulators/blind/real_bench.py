@@ -26,8 +26,8 @@ from simulators.blind.lab_priors import PRIORS, draw_kinds
 from simulators.blind.mosaic_faults import MOSAIC as MOSAIC_FAULTS
 from simulators.blind.outside_list import EVENTS, OUTSIDE
 from simulators.blind.undeclared_captures import (
-    Bench,
-    Scene,
+    TrueBench,
+    TrueScene,
     counted,
     declared_bench,
     digitize,
@@ -92,7 +92,7 @@ RGB950 = Polarimeter()
 MOSAIC = Polarimeter("mosaic_polarimeter.yaml", 16)
 
 
-class Disc(Scene):
+class RoundSample(TrueScene):
     """A scene on a ball before a dark background: soft rim, darker towards it."""
 
     def at(self, x: Array, y: Array, levels: Array | None = None) -> Array:
@@ -149,7 +149,7 @@ class _Draw:
     once: str
     states: int
 
-    def apply(self, bench: Bench, capture: str) -> TrueFault | None:
+    def apply(self, bench: TrueBench, capture: str) -> TrueFault | None:
         own = self.kind in OF_THE_CAPTURE
         # Another sample is measured later: what is a capture's own is not known of it, and does not act in it.
         if own and (capture == VALIDATION or (self.kind in ONCE and capture != self.once)):
@@ -206,7 +206,7 @@ def make_bench(
     if mosaic:
         del angles["psa"]
 
-    def sound() -> Bench:
+    def sound() -> TrueBench:
         return declared_bench(model.at(nm), nm, pixels, mosaic, electrons=electrons)
 
     found: dict[tuple[int, str | None], TrueFault] = {}
@@ -237,13 +237,13 @@ def _kinds(group: str, seed: int, random: np.random.Generator) -> list[str]:
     return [kinds[seed % len(kinds)]] if kinds else []
 
 
-def _scenes(random: np.random.Generator) -> dict[str, Scene]:
+def _scenes(random: np.random.Generator) -> dict[str, TrueScene]:
     """What stands at the sample's place in each capture."""
     return {
-        "sphere": Disc(random),
-        "flat": Scene(random, flat_mueller(random), brightness=0.3),
-        "air": Scene(random, np.eye(4)),
-        VALIDATION: Scene(random),
+        "sphere": RoundSample(random),
+        "flat": TrueScene(random, flat_mueller(random), brightness=0.3),
+        "air": TrueScene(random, np.eye(4)),
+        VALIDATION: TrueScene(random),
     }
 
 
@@ -251,13 +251,13 @@ def _scenes(random: np.random.Generator) -> dict[str, Scene]:
 class _Taken:
     """One capture of a bench: as it is, and as it would be without one of its faults."""
 
-    sound: Callable[[], Bench]
+    sound: Callable[[], TrueBench]
     draws: Sequence[_Draw]
     capture: str
-    scene: Scene
+    scene: TrueScene
     angles: dict[str, Array]
 
-    def exposed(self, without: int | None = None) -> tuple[Bench, Array, dict[int, TrueFault]]:
+    def exposed(self, without: int | None = None) -> tuple[TrueBench, Array, dict[int, TrueFault]]:
         """The bench, electrons (N, rows, columns) without noise, and what was done to it."""
         bench = self.sound()
         done = {i: d.apply(bench, self.capture) for i, d in enumerate(self.draws) if i != without}
@@ -273,7 +273,7 @@ class _Taken:
         return float(PATCH * np.sqrt(np.mean((change**2 / errors)[1:, lit])))
 
 
-def true_mueller(scene: Scene, pixels: int) -> NDArray[np.float32]:
+def true_mueller(scene: TrueScene, pixels: int) -> NDArray[np.float32]:
     """Mueller matrices (4, 4, rows, columns) over m00, where the image stands on average."""
     ys, xs = np.mgrid[0:pixels, 0:pixels] / pixels
     m = scene.at(xs, ys)

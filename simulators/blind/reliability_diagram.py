@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from simulators.blind.bench_judge import Judgement
+from simulators.blind.bench_judge import BenchJudgement
 from simulators.blind.bench_table import reliability
 
 
-def draw(judgements: Sequence[Judgement], path: Path) -> None:
+def draw(judgements: Sequence[BenchJudgement], path: Path) -> None:
     """Write the diagram; bars are one standard error of a share (Wilson's interval), numbers are the causes told."""
     from matplotlib.figure import Figure
 

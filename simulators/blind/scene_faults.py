@@ -30,7 +30,7 @@ def moved_sphere(scene: Scene, x_mm: float = 0.0, y_mm: float = 0.0, scale: floa
     return Scene(spec, scene.material)
 
 
-class ArmZero:
+class ArmZeroFault:
     """The arm stands `error_deg` further round than it reads."""
 
     def __init__(self, scene: SceneImage, error_deg: float) -> None:

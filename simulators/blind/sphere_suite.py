@@ -77,7 +77,7 @@ def _with(kind: str, random: np.random.Generator, so_far: SphereFault) -> Sphere
     scene, instrument, truth = so_far.scene, so_far.instrument, dict[str, float]()
     if kind == "arm_zero":
         truth = {"arm": _signed(random, 0.7, 4.0)}
-        return _added(so_far, kind, truth, scene=scene_faults.ArmZero(scene, truth["arm"]))
+        return _added(so_far, kind, truth, scene=scene_faults.ArmZeroFault(scene, truth["arm"]))
     if kind in ("illumination_azimuth", "analyzer_roll"):
         turn = scene_faults.turned_generator if kind == "illumination_azimuth" else scene_faults.turned_analyzer
         truth = {"azimuth": _signed(random, 0.4, 5.0)}

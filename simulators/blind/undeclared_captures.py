@@ -43,7 +43,7 @@ def polarizer_jones(azimuth_rad: float, extinction: float = 0.0) -> ComplexArray
 
 
 @dataclass
-class Bench:
+class TrueBench:
     """True state of the optics; a fault changes these numbers or hooks into `shot`, `image` and `counts`.
 
     Angles in radians. `field_retardance` gives (rows, columns) in radians to add to the generator retarder's.
@@ -144,7 +144,7 @@ def _analyzer(jones: ComplexArray) -> Array:
     return np.asarray(0.5 * np.einsum("ij,ajk,ik->a", jones, _PAULI, jones.conj()).real)
 
 
-class Scene:
+class TrueScene:
     """Mueller matrices as a smooth function of position: four materials mixed by slow waves, or one everywhere."""
 
     def __init__(self, random: np.random.Generator, mueller: Array | None = None, brightness: float = 0.6) -> None:
@@ -188,7 +188,7 @@ class Scene:
         return np.asarray(shade[..., None, None] * mixed)
 
 
-def expose(bench: Bench, scene: Scene, angles_deg: dict[str, Array]) -> Array:
+def expose(bench: TrueBench, scene: TrueScene, angles_deg: dict[str, Array]) -> Array:
     """Expected electrons (N, rows, columns) of all states; on a mosaic each pixel looks through its own polarizer."""
     n = next(iter(angles_deg.values())).size
     ys, xs = np.mgrid[0 : bench.rows, 0 : bench.columns].astype(float)
@@ -226,7 +226,7 @@ def expose(bench: Bench, scene: Scene, angles_deg: dict[str, Array]) -> Array:
     return np.asarray(out)
 
 
-def _turned(scene: Scene, bench: Bench, xs: Array, ys: Array, *, angle: float) -> Array:
+def _turned(scene: TrueScene, bench: TrueBench, xs: Array, ys: Array, *, angle: float) -> Array:
     """Mueller matrices of the scene turned counter-clockwise by an angle (radians) about the middle of the image."""
     c, s = np.cos(angle), np.sin(angle)
     x, y = xs - (bench.columns - 1) / 2, ys - (bench.rows - 1) / 2
@@ -247,7 +247,7 @@ def _on_mosaic(light: Array) -> Array:
     return out
 
 
-def digitize(bench: Bench, electrons: Array, random: np.random.Generator) -> NDArray[np.uint16]:
+def digitize(bench: TrueBench, electrons: Array, random: np.random.Generator) -> NDArray[np.uint16]:
     """Counts of expected electrons: shot noise, full well, transfer curve, read noise, black level, rounding."""
     found = np.minimum(random.poisson(np.maximum(electrons, 0)).astype(float), bench.full_well)
     for curve in bench.transfer:
@@ -257,7 +257,7 @@ def digitize(bench: Bench, electrons: Array, random: np.random.Generator) -> NDA
     return counted(bench, found + bench.read_noise * random.standard_normal(found.shape))
 
 
-def counted(bench: Bench, electrons: Array) -> NDArray[np.uint16]:
+def counted(bench: TrueBench, electrons: Array) -> NDArray[np.uint16]:
     """Counts of collected electrons (N, rows, columns), as they are stored."""
     counts = np.rint(electrons / bench.gain + BLACK)
     for change in bench.stored:
@@ -267,7 +267,7 @@ def counted(bench: Bench, electrons: Array) -> NDArray[np.uint16]:
 
 def write_capture(
     path: Path,
-    bench: Bench,
+    bench: TrueBench,
     counts: NDArray[np.uint16],
     angles_deg: dict[str, Array],
     *,
@@ -319,7 +319,7 @@ def write_capture(
         write_closing(h5, "complete", {})
 
 
-def expected_electrons(bench: Bench, electrons: Array) -> Array:
+def expected_electrons(bench: TrueBench, electrons: Array) -> Array:
     """Electrons (N, rows, columns) that the detector collects on average."""
     found = np.minimum(electrons, bench.full_well)
     for curve in bench.transfer:
@@ -327,14 +327,14 @@ def expected_electrons(bench: Bench, electrons: Array) -> Array:
     return found
 
 
-def expected(bench: Bench, electrons: Array) -> Array:
+def expected(bench: TrueBench, electrons: Array) -> Array:
     """Counts (N, rows, columns) above black that the detector reports on average."""
     return np.asarray(expected_electrons(bench, electrons) / bench.gain)
 
 
-def declared_bench(model: InstrumentModel, nm: float, size: int, mosaic: bool, *, electrons: float) -> Bench:
+def declared_bench(model: InstrumentModel, nm: float, size: int, mosaic: bool, *, electrons: float) -> TrueBench:
     """A bench that is what its model (resolved at the wavelength) declares."""
-    bench = Bench(rows=size, columns=size, mosaic=mosaic, electrons=electrons, wavelength_nm=nm)
+    bench = TrueBench(rows=size, columns=size, mosaic=mosaic, electrons=electrons, wavelength_nm=nm)
     for element in model.elements():
         azimuth = _radians(element.azimuth_deg)
         if isinstance(element, Retarder):

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from processing.arrays import Array
-from simulators.blind.undeclared_captures import Bench
+from simulators.blind.undeclared_captures import TrueBench
 from simulators.blind.undeclared_faults import Fault, Truth
 
 Angles = dict[str, Array]
@@ -20,7 +20,7 @@ Angles = dict[str, Array]
 def _recorded(name: str, change: Callable[[Angles], Angles]) -> Fault:
     """The angles in the capture file are not those of the bench."""
 
-    def fault(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+    def fault(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
         bench.recorded.append(change)
         return Truth(name)
 
@@ -30,7 +30,7 @@ def _recorded(name: str, change: Callable[[Angles], Angles]) -> Fault:
 def _stored(name: str, change: Callable[[Array], Array]) -> Fault:
     """The frames in the capture file are not as the camera took them."""
 
-    def fault(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+    def fault(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
         bench.stored.append(change)
         return Truth(name)
 
@@ -40,7 +40,7 @@ def _stored(name: str, change: Callable[[Array], Array]) -> Fault:
 def _zero(name: str, attribute: str, steps_deg: tuple[float, ...]) -> Fault:
     """An element stands at another mark of its mount."""
 
-    def fault(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+    def fault(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
         step = float(random.choice(steps_deg))
         setattr(bench, attribute, getattr(bench, attribute) + np.deg2rad(step))
         return Truth(name, "", {"azimuth": step})
@@ -48,7 +48,7 @@ def _zero(name: str, attribute: str, steps_deg: tuple[float, ...]) -> Fault:
     return fault
 
 
-def wavelength(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def wavelength(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """The filter in the beam is not the one that the capture file names (RGB950: 451 for 662 nm, or the reverse)."""
     retardances = {451.0: (130.01, 143.13), 662.0: (127.12, 94.78)}
     other = next(nm for nm in retardances if nm != bench.wavelength_nm)

@@ -32,7 +32,7 @@ _SLICE_S = 0.2
 _Address = tuple[str, int]
 
 
-class Device(Protocol):
+class RegisterDevice(Protocol):
     """The camera behind the channel; called from the channel's thread."""
 
     def read(self, address: int, count: int) -> bytes:
@@ -66,7 +66,7 @@ def _broadcast_sockets(address: str) -> list[socket.socket]:
 class ControlChannel:
     """Answers at one address from `open` to `close`, in a thread of its own."""
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: RegisterDevice) -> None:
         self._device = device
         self._socket: socket.socket | None = None
         self._heard: list[socket.socket] = []

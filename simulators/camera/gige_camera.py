@@ -33,7 +33,7 @@ from simulators.camera.frame_packets import (
     send,
     with_chunks,
 )
-from simulators.camera.genicam.features import LOADS, START, STOP, TRIGGER, Features
+from simulators.camera.genicam.features import LOADS, START, STOP, TRIGGER, FeatureValues
 from simulators.camera.genicam.formula import Number
 from simulators.camera.genicam.node_tree import REGISTERS, NodeError, NodeTree
 from simulators.camera.genicam.power_up import power_up
@@ -153,7 +153,7 @@ class GigeCamera:
         self._nodes = NodeTree(root, self._memory, description.source)
         try:
             power_up(self._nodes, self._sensor, {**texts, "DeviceSerialNumber": self.serial})
-            self._features = Features(self._nodes, self._sensor, complete=self._complete)
+            self._features = FeatureValues(self._nodes, self._sensor, complete=self._complete)
             for name, value in description.at_power_up.items():
                 if name in self._nodes:
                     self.leave(name, value)

@@ -19,7 +19,7 @@ from drivers.errors import DeviceError
 from drivers.motion import MotionAxis
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
-from simulators.clock import Clock, patient_clock
+from simulators.clock import FastClock, patient_clock
 from simulators.conformance.served_axes import AxisTests
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.emulator import Emulator
@@ -80,7 +80,7 @@ class DriverNoise(AxisTests):
 
     def test_noise_on_the_line_never_gives_a_wrong_position(self, kind: str) -> None:
         seed = seed_of(kind)
-        clock = Clock(300.0, base=patient_clock())
+        clock = FastClock(300.0, base=patient_clock())
         emulator = served_kinds()[kind](ServeOptions(homed=True, clock=clock, limits_deg=(-400.0, 400.0)))
         wire = NoisyWire(emulator, seed, rate=0.0)
         targets = random.Random(seed)
@@ -113,7 +113,7 @@ class EmulatorNoise(AxisTests):
     def test_an_emulator_swallows_anything_and_still_answers(self, kind: str) -> None:
         seed = seed_of(kind)
         noise = random.Random(seed)
-        emulator = served_kinds()[kind](ServeOptions(clock=Clock(50.0, base=patient_clock())))
+        emulator = served_kinds()[kind](ServeOptions(clock=FastClock(50.0, base=patient_clock())))
         line = emulator.connect() if hasattr(emulator, "connect") else emulator
         spoken = 0
         for _ in range(10 * ROUNDS):

@@ -104,7 +104,7 @@ class GigeTwin:
         self._camera.lost_ratio = share
 
 
-class Scene:
+class LightScene:
     """What the camera sees: its own exposure number, exposure time and an angle that the test turns."""
 
     def __init__(self) -> None:
@@ -142,12 +142,12 @@ class CameraConformance:
         return GigeTwin(show)
 
     @pytest.fixture
-    def scene(self) -> Scene:
+    def scene(self) -> LightScene:
         """What the twin sees."""
-        return Scene()
+        return LightScene()
 
     @pytest.fixture
-    def twin(self, scene: Scene) -> Iterator[CameraTwin]:
+    def twin(self, scene: LightScene) -> Iterator[CameraTwin]:
         """The twin, plugged in."""
         twin = self.make_twin(scene)
         twin.start()
@@ -170,7 +170,7 @@ class CameraConformance:
 
     # --- settings and identity ---------------------------------------------------------------------------
 
-    def test_opening_exposes_nothing(self, twin: CameraTwin, scene: Scene) -> None:
+    def test_opening_exposes_nothing(self, twin: CameraTwin, scene: LightScene) -> None:
         with self.open(twin.entry) as camera:
             with pytest.raises(CameraError, match="not configured"):
                 camera.capture()
@@ -211,7 +211,7 @@ class CameraConformance:
 
     # --- frames ------------------------------------------------------------------------------------------
 
-    def test_frames_are_whole_numbered_and_stay_as_they_were(self, scene: Scene, camera: Camera) -> None:
+    def test_frames_are_whole_numbered_and_stay_as_they_were(self, scene: LightScene, camera: Camera) -> None:
         frames = camera.capture(8)
         for number, frame in enumerate(frames, start=1):
             assert frame.pixels.dtype == np.uint16
@@ -249,7 +249,7 @@ class CameraConformance:
             other.stop()
             twin.start()
 
-    def test_every_frame_of_a_40_state_run_belongs_to_its_angle(self, scene: Scene, camera: Camera) -> None:
+    def test_every_frame_of_a_40_state_run_belongs_to_its_angle(self, scene: LightScene, camera: Camera) -> None:
         # The bench starts to move as soon as the exposure has ended, while the frame is still on its way.
         seen = []
         for state in range(40):
@@ -260,14 +260,14 @@ class CameraConformance:
             seen.append(read_stamp(exposure.frame().pixels)[0])
         assert seen == [9.0 * state for state in range(40)]
 
-    def test_a_frame_in_flight_when_a_setting_changes_is_thrown_away(self, scene: Scene, camera: Camera) -> None:
+    def test_a_frame_in_flight_when_a_setting_changes_is_thrown_away(self, scene: LightScene, camera: Camera) -> None:
         camera.configure(CameraSettings(exposure_s=0.1))
         camera.trigger()
         camera.configure(CameraSettings(exposure_s=0.02))
         assert read_stamp(camera.capture()[0].pixels)[1] == pytest.approx(0.02, abs=1e-6)
 
     def test_an_exposure_that_nobody_collects_does_not_become_the_next_frame(
-        self, scene: Scene, camera: Camera
+        self, scene: LightScene, camera: Camera
     ) -> None:
         scene.angle_deg = 1.0
         camera.trigger().wait_exposed()
@@ -279,7 +279,7 @@ class CameraConformance:
 
     @pytest.mark.parametrize("share", [0.5, 1.0])
     def test_a_frame_that_did_not_come_whole_is_retaken_and_counted(
-        self, scene: Scene, twin: CameraTwin, camera: Camera, share: float
+        self, scene: LightScene, twin: CameraTwin, camera: Camera, share: float
     ) -> None:
         scene.before = lambda number: twin.lose(share if number == 2 else 0.0)
         assert [read_stamp(frame.pixels)[2] for frame in camera.capture(3)] == [1, 3, 4]
@@ -292,7 +292,9 @@ class CameraConformance:
         twin.lose(0.0)
         camera.capture()
 
-    def test_a_split_exposure_is_never_retaken_by_itself(self, scene: Scene, twin: CameraTwin, camera: Camera) -> None:
+    def test_a_split_exposure_is_never_retaken_by_itself(
+        self, scene: LightScene, twin: CameraTwin, camera: Camera
+    ) -> None:
         # After wait_exposed the bench may have moved, so only the caller can take it again.
         twin.lose(0.5)
         exposure = camera.trigger()
@@ -303,7 +305,7 @@ class CameraConformance:
         twin.lose(0.0)
 
     def test_a_camera_that_vanishes_is_noticed_and_can_be_opened_again(
-        self, scene: Scene, twin: CameraTwin, camera: Camera
+        self, scene: LightScene, twin: CameraTwin, camera: Camera
     ) -> None:
         camera.capture(2)
         # Long enough for the camera to vanish before its end on any machine.
@@ -332,7 +334,7 @@ class CameraConformance:
     @pytest.mark.usefixtures("twin")
     def test_a_camera_that_is_not_there_is_named(self) -> None:
         with pytest.raises(CameraNotFound):
-            self.open(self.make_twin(Scene()).elsewhere)
+            self.open(self.make_twin(LightScene()).elsewhere)
 
     def test_a_closed_camera_says_so(self, camera: Camera) -> None:
         camera.close()

@@ -12,7 +12,7 @@ import pytest
 from drivers.motion import AxisConfig, MotionAxis
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
-from simulators.clock import Clock, patient_clock
+from simulators.clock import FastClock, patient_clock
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.emulator import Emulator
 from simulators.serial.reply_faults import FaultSchedule
@@ -62,7 +62,7 @@ class AxisTests:
     def served(self, kind: str, homed: bool = True, speed: float = FAST, **options: object) -> Iterator[ServedAxes]:
         """Serve one kind, homed so that a test need not wait for homing; overridden where the axis has no wire."""
         options = {"limits_deg": WIDE, "faults": FaultSchedule(seed=7)} | options
-        clock = Clock(speed, base=patient_clock())
+        clock = FastClock(speed, base=patient_clock())
         emulator = served_kinds()[kind](ServeOptions(homed=homed, clock=clock, **options))  # type: ignore[arg-type]
         with port_for(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
             yield ServedAxes(emulator, port, lines, axis_configs(emulator, port.path, homed=homed))

@@ -13,7 +13,7 @@ from drivers.errors import DeviceError, PortBusy, ReplyTimeout
 from drivers.registry import open_source
 from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
-from simulators.clock import Clock, patient_clock
+from simulators.clock import FastClock, patient_clock
 from simulators.rig.controller_kinds import served_kinds, source_configs
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
@@ -72,7 +72,7 @@ class SourceConformance:
     @pytest.fixture
     def served(self, kind: str) -> Iterator[ServedSource]:
         """The emulator behind a port, dark as it is when it is switched on."""
-        emulator = served_kinds()[kind](ServeOptions(clock=Clock(50.0, base=patient_clock())))
+        emulator = served_kinds()[kind](ServeOptions(clock=FastClock(50.0, base=patient_clock())))
         with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
             (config,) = source_configs(emulator, port.path)
             yield ServedSource(emulator, port, lines, config, self.wavelength_nm)

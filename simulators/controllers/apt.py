@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Literal
 
 from drivers.axes.apt import Config
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
@@ -67,7 +67,9 @@ class APTEmulator(Emulator):
     )
     tells_limits = False
 
-    def __init__(self, model: APTModel, axis: EmulatedAxis, clock: Clock, faults: FaultSchedule | None = None) -> None:
+    def __init__(
+        self, model: APTModel, axis: EmulatedAxis, clock: FastClock, faults: FaultSchedule | None = None
+    ) -> None:
         super().__init__([axis], clock, faults)
         self.model = model
         self.axis = axis

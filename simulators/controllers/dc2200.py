@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from drivers.sources.dc2200 import Config
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.serial.emulator import Emulator
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
@@ -20,7 +20,10 @@ class DC2200Emulator(Emulator):
     """The LED driver box with an LED at each terminal, wavelengths in nm."""
 
     def __init__(
-        self, clock: Clock, faults: FaultSchedule | None = None, wavelengths_nm: tuple[float, float] = (662.0, 451.0)
+        self,
+        clock: FastClock,
+        faults: FaultSchedule | None = None,
+        wavelengths_nm: tuple[float, float] = (662.0, 451.0),
     ) -> None:
         super().__init__([], clock, faults)
         self.wavelengths_nm = wavelengths_nm

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from drivers.sources.dc4100 import Config
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.serial.emulator import Emulator
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
@@ -35,7 +35,7 @@ class DC4100Emulator(Emulator):
 
     def __init__(
         self,
-        clock: Clock,
+        clock: FastClock,
         faults: FaultSchedule | None = None,
         wavelengths_nm: Sequence[float | None] = (451.0, 524.0, 662.0, 947.0),
         model: str = "DC4100",

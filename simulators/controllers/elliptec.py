@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from drivers.axes.elliptec import Config
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
@@ -22,7 +22,7 @@ DATA_DIGITS = {
 }  # fmt: skip
 
 
-class Refused(Exception):
+class ElliptecError(Exception):
     """The module refuses the command; the message is the status code that it answers."""
 
 
@@ -69,13 +69,13 @@ class ElliptecModule:
 
         Raises
         ------
-        Refused
+        ElliptecError
         """
         if letters == "gs":
             status, self.status = (9 if self.axis.is_moving() else self.status), 0
             return f"GS{status:02X}"
         if self.axis.is_moving() and not (letters in ("st", "ms") and self.jogging):
-            raise Refused("09")
+            raise ElliptecError("09")
         handlers: dict[str, Callable[[str], str | None]] = {
             "in": lambda _: f"IN{self.model:02X}{self.serial_number}20201501{360:04X}{PULSES_PER_TURN:08X}",
             "gp": lambda _: self.position(),
@@ -97,7 +97,7 @@ class ElliptecModule:
             "sv": self._set_velocity,
         }
         if letters not in handlers:
-            raise Refused("03")
+            raise ElliptecError("03")
         return handlers[letters](data)
 
     def _stop(self, _: str) -> str:
@@ -108,7 +108,7 @@ class ElliptecModule:
     def _go(self, counts: int) -> None:
         target_deg = counts / self.per_deg
         if not self.axis.within(target_deg):
-            raise Refused("0C")
+            raise ElliptecError("0C")
         self.axis.move_to(target_deg)
         self.reports_end = True
 
@@ -135,7 +135,7 @@ class ElliptecModule:
     def _set_velocity(self, digits: str) -> str:
         percent = int(digits, 16)
         if not 1 <= percent <= 100:
-            raise Refused("04")
+            raise ElliptecError("04")
         self.velocity_percent = percent
         self.axis.speed_deg_s = self._full_speed_deg_s * percent / 100
         return "GS00"
@@ -152,7 +152,9 @@ class ElliptecEmulator(Emulator):
     pieces = (b"0ma", b"1mr0000", b"0ho0", b"0gp", b"0gs", b"1in", b"0sj", b"0fw", b"0st", b"\r\n")
     tells_limits = False
 
-    def __init__(self, modules: Sequence[ElliptecModule], clock: Clock, faults: FaultSchedule | None = None) -> None:
+    def __init__(
+        self, modules: Sequence[ElliptecModule], clock: FastClock, faults: FaultSchedule | None = None
+    ) -> None:
         super().__init__([module.axis for module in modules], clock, faults)
         self.modules = list(modules)
         self._buffer = ""
@@ -198,7 +200,7 @@ class ElliptecEmulator(Emulator):
                     answer: str | None = "GS00"
                 else:
                     answer = module.run(letters, data)
-            except Refused as refusal:
+            except ElliptecError as refusal:
                 answer = f"GS{refusal}"
             if answer is not None:
                 self._reply(f"{module.address}{answer}\r\n".encode("ascii"))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from drivers.axes.esp301 import Config
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.line_collector import LineCollector
 from simulators.serial.reply_faults import FaultSchedule
@@ -35,7 +35,7 @@ LONGEST_LINE = 80
 _COMMAND = re.compile(r"(\d*)([A-Z]{2})(\?|[+-]?(?:\d+\.?\d*|\.\d+)(?:E[+-]?\d+)?)?")
 
 
-class Failed(Exception):
+class Esp301Error(Exception):
     """The command fails; `code` goes into the error memory."""
 
     def __init__(self, code: int) -> None:
@@ -64,7 +64,7 @@ class ESP301Emulator(Emulator):
 
     pieces = (b"1PA", b"1OR1", b"1MO", b"TB?", b"1DH", b"1SL", b";", b"\r", b"AB", b"2TP?")
 
-    def __init__(self, stages: Sequence[ESPAxis], clock: Clock, faults: FaultSchedule | None = None) -> None:
+    def __init__(self, stages: Sequence[ESPAxis], clock: FastClock, faults: FaultSchedule | None = None) -> None:
         super().__init__([stage.axis for stage in stages], clock, faults)
         self.stages = list(stages)
         self.errors: deque[tuple[int, int]] = deque(maxlen=10)
@@ -107,9 +107,9 @@ class ESP301Emulator(Emulator):
         match = _COMMAND.fullmatch(text)
         try:
             if match is None:
-                raise Failed(6)
+                raise Esp301Error(6)
             answer = self._run(match[1], match[2], match[3] or "")
-        except Failed as failure:
+        except Esp301Error as failure:
             self.errors.append((failure.code, round(self.clock.now_s() * 1000)))
             return
         if answer is not None:
@@ -148,16 +148,16 @@ class ESP301Emulator(Emulator):
             "WS": self._wait_stop,
         }
         if letters not in by_axis:
-            raise Failed(6)
+            raise Esp301Error(6)
         if not number:
             if letters == "ST":
                 for stage in self.stages:
                     self._stop(stage)
                 return None
-            raise Failed(37)
+            raise Esp301Error(37)
         axis = int(number)
         if not 1 <= axis <= len(self.stages):
-            raise Failed(9)
+            raise Esp301Error(9)
         return by_axis[letters](self.stages[axis - 1], axis, value)
 
     def _take_error(self) -> tuple[int, int]:
@@ -204,14 +204,14 @@ class ESP301Emulator(Emulator):
 
     def _refuse_unless_free(self, stage: ESPAxis, axis: int) -> None:
         if not stage.motor_on:
-            raise Failed(axis * 100 + MOTOR_OFF)
+            raise Esp301Error(axis * 100 + MOTOR_OFF)
         if stage.axis.is_moving() and stage.axis.homing:
-            raise Failed(axis * 100 + IN_HOMING)
+            raise Esp301Error(axis * 100 + IN_HOMING)
 
     def _home(self, stage: ESPAxis, axis: int, value: str) -> None:
         self._refuse_unless_free(stage, axis)
         if value and _number(value) not in range(7):
-            raise Failed(7)
+            raise Esp301Error(7)
         stage.axis.home()
         stage.target_deg = stage.offset_deg = 0.0
 
@@ -223,7 +223,7 @@ class ESP301Emulator(Emulator):
         reported_deg = target_deg + stage.offset_deg
         if not stage.axis.within(reported_deg):
             too_far = stage.axis.max_deg is not None and reported_deg > stage.axis.max_deg
-            raise Failed(axis * 100 + (POSITIVE_LIMIT if too_far else NEGATIVE_LIMIT))
+            raise Esp301Error(axis * 100 + (POSITIVE_LIMIT if too_far else NEGATIVE_LIMIT))
         stage.target_deg = target_deg
         stage.axis.move_to(reported_deg)
         return None
@@ -256,7 +256,7 @@ class ESP301Emulator(Emulator):
         if value == "?":
             return str(stage.unit)
         if _number(value) not in range(12):
-            raise Failed(7)
+            raise Esp301Error(7)
         stage.unit = int(_number(value))
         return None
 
@@ -279,14 +279,14 @@ class ESP301Emulator(Emulator):
 
 def _number(value: str) -> float:
     if value in ("", "?"):
-        raise Failed(38)
+        raise Esp301Error(38)
     return float(value)
 
 
 def _positive(value: str, axis: int) -> float:
     number = _number(value)
     if number <= 0:
-        raise Failed(axis * 100 + 1)
+        raise Esp301Error(axis * 100 + 1)
     return number
 
 

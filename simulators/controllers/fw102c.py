@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drivers.sources.fw102c import Config
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.serial.emulator import Emulator
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
@@ -24,7 +24,7 @@ class FW102CEmulator(Emulator):
         Simulated time from one position to the next.
     """
 
-    def __init__(self, clock: Clock, faults: FaultSchedule | None = None, step_s: float = 0.5) -> None:
+    def __init__(self, clock: FastClock, faults: FaultSchedule | None = None, step_s: float = 0.5) -> None:
         super().__init__([], clock, faults)
         self.step_s = step_s
         self.blocked = False

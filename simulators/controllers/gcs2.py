@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from drivers.axes.gcs2 import Config
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.line_collector import LineCollector
 from simulators.serial.reply_faults import FaultSchedule
@@ -26,7 +26,7 @@ HELP = [
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
-class Failed(Exception):
+class Gcs2Error(Exception):
     """The command fails; `code` is what ERR? tells next."""
 
     def __init__(self, code: int) -> None:
@@ -59,7 +59,7 @@ class GCS2Emulator(Emulator):
         b"\n",
     )
 
-    def __init__(self, stages: Sequence[Stage], clock: Clock, faults: FaultSchedule | None = None) -> None:
+    def __init__(self, stages: Sequence[Stage], clock: FastClock, faults: FaultSchedule | None = None) -> None:
         super().__init__([stage.axis for stage in stages], clock, faults)
         self.stages = list(stages)
         self.model = "C-884.4DC"
@@ -94,7 +94,7 @@ class GCS2Emulator(Emulator):
         words = text.split()
         try:
             answer = self._run(words[0].upper(), words[1:])
-        except Failed as failure:
+        except Gcs2Error as failure:
             self.error = failure.code
             return
         if answer is not None:
@@ -132,7 +132,7 @@ class GCS2Emulator(Emulator):
 
     def _stage(self, axis: str) -> Stage:
         if not axis.isdigit() or not 1 <= int(axis) <= len(self.stages):
-            raise Failed(NO_AXIS)
+            raise Gcs2Error(NO_AXIS)
         return self.stages[int(axis) - 1]
 
     def _act(self, command: str, words: list[str]) -> None:
@@ -153,25 +153,25 @@ class GCS2Emulator(Emulator):
             "VEL": self._velocity,
         }
         if command not in settings:
-            raise Failed(UNKNOWN)
+            raise Gcs2Error(UNKNOWN)
         if not words or len(words) % 2:
-            raise Failed(SYNTAX)
+            raise Gcs2Error(SYNTAX)
         for axis, value in zip(words[::2], words[1::2], strict=True):
             if not _NUMBER.fullmatch(value):
-                raise Failed(SYNTAX)
+                raise Gcs2Error(SYNTAX)
             settings[command](self._stage(axis), float(value))
 
     def _move(self, stage: Stage, target_deg: float) -> None:
         if not stage.axis.homed or not stage.servo:
-            raise Failed(NOT_REFERENCED)
+            raise Gcs2Error(NOT_REFERENCED)
         if not stage.axis.within(target_deg):
-            raise Failed(OUT_OF_LIMITS)
+            raise Gcs2Error(OUT_OF_LIMITS)
         stage.target_deg = target_deg
         stage.axis.move_to(target_deg)
 
     def _reference(self, stage: Stage) -> None:
         if not stage.servo:
-            raise Failed(NOT_REFERENCED)
+            raise Gcs2Error(NOT_REFERENCED)
         stage.target_deg = 0.0
         stage.axis.home()
 
@@ -182,7 +182,7 @@ class GCS2Emulator(Emulator):
 
     def _velocity(self, stage: Stage, value: float) -> None:
         if value <= 0:
-            raise Failed(OUT_OF_LIMITS)
+            raise Gcs2Error(OUT_OF_LIMITS)
         stage.axis.speed_deg_s = value
 
     def _do_make_foreign(self, reply: bytes) -> bytes:

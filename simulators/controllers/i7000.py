@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drivers.sources.i7000 import Config
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.serial.emulator import Emulator
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
@@ -15,7 +15,7 @@ RUN_OUT = 0x04
 class I7060Emulator(Emulator):
     """The module at address 01, all relays open; light passes while relay 0 is closed."""
 
-    def __init__(self, clock: Clock, faults: FaultSchedule | None = None) -> None:
+    def __init__(self, clock: FastClock, faults: FaultSchedule | None = None) -> None:
         super().__init__([], clock, faults)
         self._outputs = 0
         self._watchdog_s: float | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from drivers.sources.sc10 import Config
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.serial.emulator import Emulator
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
@@ -22,7 +22,7 @@ class SC10Emulator(Emulator):
         Simulated time that the blade takes.
     """
 
-    def __init__(self, clock: Clock, faults: FaultSchedule | None = None, blade_s: float = 0.01) -> None:
+    def __init__(self, clock: FastClock, faults: FaultSchedule | None = None, blade_s: float = 0.01) -> None:
         super().__init__([], clock, faults)
         self.blade_s = blade_s
         self.interlock_tripped = False

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from drivers.axes.smc100 import Config
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.line_collector import LineCollector
 from simulators.serial.reply_faults import FaultSchedule
@@ -30,7 +30,7 @@ _COMMAND = re.compile(r"(\d*)([A-Za-z]{2})(.*)")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
-class Refused(Exception):
+class Smc100Error(Exception):
     """The controller refuses the command; the message is the letter for its error memory."""
 
 
@@ -87,7 +87,7 @@ class SMC100Controller:
 
         Raises
         ------
-        Refused
+        Smc100Error
             With the letter of the error.
         """
         handlers: dict[str, Callable[[str], str | None]] = {
@@ -114,12 +114,12 @@ class SMC100Controller:
         if letters in self.settings:
             return self._keep(letters, value)
         if letters not in handlers:
-            raise Refused("A")
+            raise Smc100Error("A")
         return handlers[letters](value)
 
     def _id(self, value: str) -> str:
         if value != "?":
-            raise Refused("D")
+            raise Smc100Error("D")
         return self.stage
 
     def _take_error(self, _: str) -> str:
@@ -132,9 +132,9 @@ class SMC100Controller:
             return f"{now:g}", 0.0
         new = _number(value)
         if not low <= new <= high:
-            raise Refused("C")
+            raise Smc100Error("C")
         if self.state() in (0x1E, 0x28):
-            raise Refused("L" if self.state() == 0x1E else "M")
+            raise Smc100Error("L" if self.state() == 0x1E else "M")
         return None, new
 
     def _keep(self, letters: str, value: str) -> str | None:
@@ -149,9 +149,9 @@ class SMC100Controller:
         if value == "?":
             return str(int(self.configuring))
         if value not in ("0", "1"):
-            raise Refused("C")
+            raise Smc100Error("C")
         if self.state() not in (0x0A, 0x14):
-            raise Refused("D")
+            raise Smc100Error("D")
         self.configuring = value == "1"
         return None
 
@@ -183,9 +183,9 @@ class SMC100Controller:
         state = self.state()
         refusals = {0x1E: "L", 0x28: "M", 0x3C: "J"}
         if state < 0x1E:
-            raise Refused("I" if state == 0x14 else "H")
+            raise Smc100Error("I" if state == 0x14 else "H")
         if state in refusals:
-            raise Refused(refusals[state])
+            raise Smc100Error(refusals[state])
 
     def _absolute(self, value: str) -> str | None:
         if value == "?":
@@ -193,7 +193,7 @@ class SMC100Controller:
         target_deg = _number(value)
         self._refuse_unless_ready()
         if not self.axis.within(target_deg):
-            raise Refused("G")
+            raise Smc100Error("G")
         self.target_deg, self.came_by = target_deg, 0x33
         self.axis.move_to(target_deg)
         return None
@@ -208,9 +208,9 @@ class SMC100Controller:
     def _home(self, _: str) -> None:
         state = self.state()
         if state == 0x14:
-            raise Refused("I")
+            raise Smc100Error("I")
         if state >= 0x1E:
-            raise Refused({0x1E: "L", 0x28: "M", 0x3C: "J"}.get(state, "K"))
+            raise Smc100Error({0x1E: "L", 0x28: "M", 0x3C: "J"}.get(state, "K"))
         self.target_deg, self.came_by = 0.0, 0x32
         self.axis.home()
 
@@ -224,12 +224,12 @@ class SMC100Controller:
         if value == "?":
             return str(int(not self.disabled))
         if value not in ("0", "1"):
-            raise Refused("C")
+            raise Smc100Error("C")
         state = self.state()
         if state < 0x1E:
-            raise Refused("H")
+            raise Smc100Error("H")
         if state in (0x1E, 0x28):
-            raise Refused("L" if state == 0x1E else "M")
+            raise Smc100Error("L" if state == 0x1E else "M")
         self.disabled = value == "0"
         self.came_by = 0x34
         return None
@@ -242,7 +242,7 @@ class SMC100Controller:
 
 def _number(value: str) -> float:
     if not _NUMBER.fullmatch(value):
-        raise Refused("C")
+        raise Smc100Error("C")
     return float(value)
 
 
@@ -265,7 +265,7 @@ class SMC100Emulator(Emulator):
     )
 
     def __init__(
-        self, controllers: Sequence[SMC100Controller], clock: Clock, faults: FaultSchedule | None = None
+        self, controllers: Sequence[SMC100Controller], clock: FastClock, faults: FaultSchedule | None = None
     ) -> None:
         super().__init__([controller.axis for controller in controllers], clock, faults)
         self.controllers = {controller.address: controller for controller in controllers}
@@ -293,7 +293,7 @@ class SMC100Emulator(Emulator):
                 continue
             try:
                 answer = controller.run(letters, value)
-            except Refused as refusal:
+            except Smc100Error as refusal:
                 controller.error = str(refusal)
                 continue
             if answer is not None:

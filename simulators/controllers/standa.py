@@ -17,7 +17,7 @@ from drivers.axes.standa import (
     Config,
 )
 from drivers.standa_frames import ECHOED, LAYOUTS, UNKNOWN_COMMAND, WRONG_CHECKSUM, WRONG_VALUE, checksum, message
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
@@ -66,7 +66,7 @@ class StandaEmulator(Emulator):
         b"gser",
     )
 
-    def __init__(self, axis: EmulatedAxis, clock: Clock, faults: FaultSchedule | None = None) -> None:
+    def __init__(self, axis: EmulatedAxis, clock: FastClock, faults: FaultSchedule | None = None) -> None:
         super().__init__([axis], clock, faults)
         self.axis = axis
         self.alarm = False

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from drivers.axes.xps import Config
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
@@ -23,7 +23,7 @@ END = ",EndOfAPI"
 _CALL = re.compile(r"\s*(\w+)\((.*)\)")
 
 
-class Failed(Exception):
+class XpsError(Exception):
     """The function fails; `code` is the first field of the answer."""
 
     def __init__(self, code: int) -> None:
@@ -75,7 +75,7 @@ class Gathering:
 
 
 @dataclass
-class Group:
+class AxisGroup:
     """A group with one positioner, `name`.Pos."""
 
     name: str
@@ -109,7 +109,7 @@ class XPSEmulator(Emulator):
         *(b"GroupInitialize(Group1)", b"GroupHomeSearch(Group1)", b"GroupMoveAbort(Group1)", b"double *,"),
     )
 
-    def __init__(self, groups: Sequence[Group], clock: Clock, faults: FaultSchedule | None = None) -> None:
+    def __init__(self, groups: Sequence[AxisGroup], clock: FastClock, faults: FaultSchedule | None = None) -> None:
         super().__init__([group.axis for group in groups], clock, faults)
         self.groups = {group.name: group for group in groups}
         self.gathering = Gathering()
@@ -134,7 +134,7 @@ class XPSConversation(Emulator):
         self._lock = controller._lock
         self._controller = controller
         self._buffer = ""
-        self._waits_for: Group | None = None
+        self._waits_for: AxisGroup | None = None
 
     def _do_receive(self, data: bytes) -> None:
         self._buffer = (self._buffer + data.decode("latin-1"))[-4096:]
@@ -147,7 +147,7 @@ class XPSConversation(Emulator):
             self._controller.gathering.look(self.clock.now_s())
             try:
                 answer = self._run(text)
-            except Failed as failure:
+            except XpsError as failure:
                 self._reply(f"{failure.code},{text.strip()}{END}".encode("latin-1"))
                 continue
             if answer is not None:
@@ -156,7 +156,7 @@ class XPSConversation(Emulator):
     def _run(self, text: str) -> str | None:
         call = _CALL.fullmatch(text)
         if call is None:
-            raise Failed(WRONG_FORMAT)
+            raise XpsError(WRONG_FORMAT)
         name, words = call[1], [word.strip() for word in call[2].split(",")]
         if name == "FirmwareVersionGet":
             return "XPS-C8 Firmware V2.6.x"
@@ -169,7 +169,7 @@ class XPSConversation(Emulator):
             return f"{';'.join(groups)};;{';'.join(f'{group}.Pos' for group in groups)}"
         if name.startswith("Gathering"):
             return self._gather(name.removeprefix("Gathering"), words)
-        functions: dict[str, Callable[[Group, list[str]], str | None]] = {
+        functions: dict[str, Callable[[AxisGroup, list[str]], str | None]] = {
             "GroupStatusGet": lambda group, _: str(group.status()),
             "GroupPositionCurrentGet": lambda group, _: f"{group.axis.position_deg():.9g}",
             "GroupVelocityCurrentGet": lambda group, _: f"{group.axis.velocity_deg_s():.9g}",
@@ -196,65 +196,65 @@ class XPSConversation(Emulator):
             "PositionerPositionCompareDisable": lambda group, _: self._switch_compare(group, False),
         }
         if name not in functions:
-            raise Failed(UNKNOWN)
+            raise XpsError(UNKNOWN)
         group = self._controller.groups.get(words[0].partition(".")[0])
         if group is None:
-            raise Failed(NO_GROUP)
+            raise XpsError(NO_GROUP)
         return functions[name](group, words[1:])
 
-    def _initialize(self, group: Group, _: list[str]) -> str:
+    def _initialize(self, group: AxisGroup, _: list[str]) -> str:
         if group.status() != 0:
-            raise Failed(NOT_ALLOWED)
+            raise XpsError(NOT_ALLOWED)
         group.initialized = group.enabled = True
         return ""
 
-    def _home(self, group: Group, _: list[str]) -> None:
+    def _home(self, group: AxisGroup, _: list[str]) -> None:
         if group.status() != 42:
-            raise Failed(NOT_ALLOWED)
+            raise XpsError(NOT_ALLOWED)
         group.axis.home()
         group.came_by, group.aborted, self._waits_for = 11, False, group
 
-    def _move(self, group: Group, words: list[str], from_deg: float = 0.0) -> None:
+    def _move(self, group: AxisGroup, words: list[str], from_deg: float = 0.0) -> None:
         if not 10 <= group.status() <= 18:
-            raise Failed(NOT_ALLOWED)
+            raise XpsError(NOT_ALLOWED)
         target_deg = from_deg + _numbers(words, 1)[0]
         if not group.axis.within(target_deg):
-            raise Failed(OUT_OF_RANGE)
+            raise XpsError(OUT_OF_RANGE)
         group.axis.move_to(target_deg)
         group.came_by, group.aborted, self._waits_for = 12, False, group
 
-    def _abort(self, group: Group, _: list[str]) -> str:
+    def _abort(self, group: AxisGroup, _: list[str]) -> str:
         if group.status() != 44:
-            raise Failed(NOT_ALLOWED)
+            raise XpsError(NOT_ALLOWED)
         group.axis.stop()
         group.aborted = True
         return ""
 
-    def _kill(self, group: Group, _: list[str]) -> str:
+    def _kill(self, group: AxisGroup, _: list[str]) -> str:
         group.aborted = group.axis.is_moving()
         group.axis.lose_reference()
         group.initialized = group.jogs = False
         return ""
 
-    def _enable(self, group: Group, on: bool) -> str:
+    def _enable(self, group: AxisGroup, on: bool) -> str:
         if group.status() not in ((20,) if on else range(10, 19)):
-            raise Failed(NOT_ALLOWED)
+            raise XpsError(NOT_ALLOWED)
         group.enabled, group.came_by = on, 10
         return ""
 
-    def _switch_jog(self, group: Group, on: bool) -> str:
+    def _switch_jog(self, group: AxisGroup, on: bool) -> str:
         allowed = 10 <= group.status() <= 18 if on else group.jogs and not group.axis.is_moving()
         if not allowed:
-            raise Failed(NOT_ALLOWED)
+            raise XpsError(NOT_ALLOWED)
         group.jogs, group.jog, group.came_by = on, (0.0, group.axis.acceleration_deg_s2), 15
         return ""
 
-    def _jog(self, group: Group, words: list[str]) -> str:
+    def _jog(self, group: AxisGroup, words: list[str]) -> str:
         velocity_deg_s, acceleration_deg_s2 = _numbers(words, 2)
         if not group.jogs:
-            raise Failed(NOT_ALLOWED)
+            raise XpsError(NOT_ALLOWED)
         if abs(velocity_deg_s) > group.axis.speed_deg_s or not 0 < acceleration_deg_s2 <= 1e6:
-            raise Failed(OUT_OF_RANGE)
+            raise XpsError(OUT_OF_RANGE)
         group.jog = (velocity_deg_s, acceleration_deg_s2)
         if velocity_deg_s:
             group.axis.run(velocity_deg_s)
@@ -271,10 +271,10 @@ class XPSConversation(Emulator):
             return ";".join(f"{names[axis]}.Pos.{what}" for axis, what in gathering.types)
         elif name == "Run":
             if not gathering.types:
-                raise Failed(NOT_ALLOWED)
+                raise XpsError(NOT_ALLOWED)
             wanted, divisor = _numbers(words, 2)
             if wanted < 1 or divisor < 1:
-                raise Failed(OUT_OF_RANGE)
+                raise XpsError(OUT_OF_RANGE)
             self._controller.gathering = Gathering(gathering.types, [], int(wanted), divisor * CYCLE_S, now_s)
         elif name in ("Stop", "StopAndSave"):
             gathering.wanted = len(gathering.samples)
@@ -286,31 +286,31 @@ class XPSConversation(Emulator):
             first, count = (*_numbers(words[:1], 1), 1) if name == "DataGet" else _numbers(words[:2], 2)
             lines = gathering.samples[int(first) : int(first + count)]
             if first < 0 or len(lines) < count:
-                raise Failed(OUT_OF_RANGE)
+                raise XpsError(OUT_OF_RANGE)
             return "".join(f"{';'.join(f'{value:.9g}' for value in line)}\n" for line in lines)
         else:
-            raise Failed(UNKNOWN)
+            raise XpsError(UNKNOWN)
         return ""
 
     def _gathered(self, word: str) -> tuple[EmulatedAxis, str]:
         """The axis of ``Group1.Pos.CurrentPosition`` and what is gathered of it."""
         group, _, what = word.partition(".Pos.")
         if group not in self._controller.groups or what not in ("CurrentPosition", "CurrentVelocity"):
-            raise Failed(WRONG_FORMAT)
+            raise XpsError(WRONG_FORMAT)
         return self._controller.groups[group].axis, what
 
-    def _set_compare(self, group: Group, words: list[str]) -> str:
+    def _set_compare(self, group: AxisGroup, words: list[str]) -> str:
         low_deg, high_deg, step_deg = _numbers(words, 3)
         if group.compare.on or not 10 <= group.status() <= 18:
-            raise Failed(NOT_ALLOWED)
+            raise XpsError(NOT_ALLOWED)
         if not (step_deg > 0 and low_deg < high_deg and group.axis.within(low_deg) and group.axis.within(high_deg)):
-            raise Failed(OUT_OF_RANGE)
+            raise XpsError(OUT_OF_RANGE)
         group.compare = PositionCompare(low_deg, high_deg, step_deg)
         return ""
 
-    def _switch_compare(self, group: Group, on: bool) -> str:
+    def _switch_compare(self, group: AxisGroup, on: bool) -> str:
         if on and group.compare.step_deg == 0:
-            raise Failed(NOT_ALLOWED)
+            raise XpsError(NOT_ALLOWED)
         group.compare.look(group.axis.position_deg())
         group.compare.on = on
         return ""
@@ -336,9 +336,9 @@ def _numbers(words: list[str], count: int) -> list[float]:
     try:
         numbers = [float(word) for word in words]
     except ValueError:
-        raise Failed(WRONG_FORMAT) from None
+        raise XpsError(WRONG_FORMAT) from None
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise Failed(WRONG_FORMAT)
+        raise XpsError(WRONG_FORMAT)
     return numbers
 
 
@@ -356,7 +356,8 @@ def make(options: ServeOptions) -> XPSEmulator:
     """Two groups, Group1 and Group2, not initialized, with travel from -170 to 170 degrees."""
     low, high = options.limits_deg or (-170.0, 170.0)
     groups = [
-        Group(f"Group{k + 1}", options.axis(low, high, 12.0 * (k + 1)), options.homed) for k in range(options.axes or 2)
+        AxisGroup(f"Group{k + 1}", options.axis(low, high, 12.0 * (k + 1)), options.homed)
+        for k in range(options.axes or 2)
     ]
     return XPSEmulator(groups, options.clock, options.faults)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from drivers.axes.zaber import Config
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.line_collector import LineCollector
 from simulators.serial.reply_faults import FaultSchedule
@@ -233,7 +233,7 @@ class ZaberEmulator(Emulator):
 
     pieces = (b"/1 1 move abs ", b"/1 home", b"/0 0 01 get pos:", b"/2 set maxspeed ", b"/1 move vel ", b"stop", b"\n")
 
-    def __init__(self, devices: Sequence[ZaberDevice], clock: Clock, faults: FaultSchedule | None = None) -> None:
+    def __init__(self, devices: Sequence[ZaberDevice], clock: FastClock, faults: FaultSchedule | None = None) -> None:
         super().__init__([device.axis for device in devices], clock, faults)
         self.devices = list(devices)
         self._lines = LineCollector()

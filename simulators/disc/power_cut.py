@@ -44,7 +44,7 @@ class _File:
     waiting: list[Call] = field(default_factory=list)
 
 
-class Disc:
+class UnreliableDisc:
     """Files and names, each as they are for programs and as they would be after a power cut now."""
 
     def __init__(self) -> None:

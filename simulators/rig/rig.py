@@ -23,7 +23,7 @@ from simulators.bench.scene import Scene
 from simulators.camera.exposure import ExposureInfo
 from simulators.camera.gige_camera import GigeCamera
 from simulators.camera.pixel_stamp import stamp
-from simulators.clock import Clock, patient_clock
+from simulators.clock import FastClock, patient_clock
 from simulators.rig.controller_kinds import served_kinds
 from simulators.rig.model import SimulatorConfig
 from simulators.serial.emulator import Emulator
@@ -45,7 +45,7 @@ class SimulatedRig:
 
     def __init__(self, config: SimulatorConfig, *, with_camera: bool = True) -> None:
         self.config = config
-        self.clock = Clock(config.clock_speed, base=patient_clock())
+        self.clock = FastClock(config.clock_speed, base=patient_clock())
         self.emulators: dict[str, Emulator] = {}
         self.bench: SimulatedBench | None = None
         self.camera: GigeCamera | None = None

@@ -9,7 +9,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 
-from simulators.clock import Clock, TrapezoidMotion
+from simulators.clock import FastClock, TrapezoidMotion
 from simulators.serial.reply_faults import FaultSchedule
 
 
@@ -18,7 +18,7 @@ class EmulatedAxis:
 
     Parameters
     ----------
-    clock : Clock
+    clock : FastClock
     speed_deg_s, acceleration_deg_s2 : float
         Of moves and homing.
     min_deg, max_deg : float or None
@@ -34,7 +34,7 @@ class EmulatedAxis:
 
     def __init__(
         self,
-        clock: Clock,
+        clock: FastClock,
         speed_deg_s: float = 300.0,
         acceleration_deg_s2: float = 1500.0,
         *,
@@ -198,7 +198,7 @@ class Emulator(ABC):
     pieces: Sequence[bytes] = ()
     tells_limits: bool = True
 
-    def __init__(self, axes: Sequence[EmulatedAxis], clock: Clock, faults: FaultSchedule | None = None) -> None:
+    def __init__(self, axes: Sequence[EmulatedAxis], clock: FastClock, faults: FaultSchedule | None = None) -> None:
         self.axes = list(axes)
         self.clock = clock
         self.faults = faults or FaultSchedule()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.serial.emulator import EmulatedAxis
 from simulators.serial.reply_faults import FaultSchedule
 
@@ -37,7 +37,7 @@ class ServeOptions:
     acceleration_deg_s2: float = 1500.0
     homed: bool = False
     true_angle: Callable[[float], float] | None = None
-    clock: Clock = field(default_factory=Clock)
+    clock: FastClock = field(default_factory=FastClock)
     faults: FaultSchedule = field(default_factory=FaultSchedule)
 
     def axis(self, low_deg: float | None, high_deg: float | None, start_deg: float) -> EmulatedAxis:

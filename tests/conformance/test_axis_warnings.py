@@ -9,7 +9,7 @@ from drivers.errors import MotionFailed, WrongDevice
 from drivers.motion import MotionAxis
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
-from simulators.clock import Clock, patient_clock
+from simulators.clock import FastClock, patient_clock
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.emulator import Emulator
 from simulators.serial.serve_options import ServeOptions
@@ -18,7 +18,7 @@ from simulators.serial.tcp_port import port_for
 
 @contextmanager
 def opened(kind: str, model: str | None = None, **changes: object) -> Iterator[tuple[Emulator, MotionAxis]]:
-    emulator = served_kinds()[kind](ServeOptions(homed=True, model=model, clock=Clock(100.0, base=patient_clock())))
+    emulator = served_kinds()[kind](ServeOptions(homed=True, model=model, clock=FastClock(100.0, base=patient_clock())))
     with port_for(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         config = axis_configs(emulator, port.path, homed=True)[0].model_copy(update=changes)
         yield emulator, open_axis("axis", config, lines)

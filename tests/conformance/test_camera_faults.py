@@ -22,12 +22,12 @@ from simulators.camera.exposure import ExposureInfo
 from simulators.camera.gige_camera import GigeCamera
 from simulators.camera.pixel_stamp import read_stamp
 from simulators.clock import patient_clock
-from simulators.conformance.camera import Scene, pixel_source
+from simulators.conformance.camera import LightScene, pixel_source
 
 SIZE = (128, 64)
 
 
-def expose_unasked(simulated: GigeCamera, scene: Scene) -> None:
+def expose_unasked(simulated: GigeCamera, scene: LightScene) -> None:
     """Start an exposure behind the driver's back; returns when it has begun, however busy the machine is."""
     before, deadline_s = scene.exposures, patient_clock().now_s() + 10
     simulated.fire(unasked=True)
@@ -37,12 +37,12 @@ def expose_unasked(simulated: GigeCamera, scene: Scene) -> None:
 
 
 @pytest.fixture
-def scene() -> Scene:
-    return Scene()
+def scene() -> LightScene:
+    return LightScene()
 
 
 @pytest.fixture
-def simulated(scene: Scene) -> Iterator[GigeCamera]:
+def simulated(scene: LightScene) -> Iterator[GigeCamera]:
     with GigeCamera("FAULT1", *SIZE, pixel_source(scene)) as camera:
         yield camera
 
@@ -55,7 +55,7 @@ def camera(simulated: GigeCamera) -> Iterator[aravis.AravisCamera]:
 
 
 def test_an_incomplete_frame_is_retaken_logged_and_counted(
-    scene: Scene, simulated: GigeCamera, caplog: pytest.LogCaptureFixture
+    scene: LightScene, simulated: GigeCamera, caplog: pytest.LogCaptureFixture
 ) -> None:
     scene.before = lambda number: setattr(simulated, "lost_ratio", 0.5 if number == 2 else 0.0)
     # Asked again for packets, the camera would often send all of them.
@@ -69,7 +69,7 @@ def test_an_incomplete_frame_is_retaken_logged_and_counted(
     assert [record.getMessage() for record in caplog.records if "retake 1 of 3" in record.getMessage()]
 
 
-def test_two_percent_of_packets_lost_costs_time_and_nothing_else(scene: Scene, simulated: GigeCamera) -> None:
+def test_two_percent_of_packets_lost_costs_time_and_nothing_else(scene: LightScene, simulated: GigeCamera) -> None:
     # 14 packets a frame: one frame in four is hit, and that none of 40 is happens once in 80 000 runs.
     config = aravis.Config(device="127.0.0.1", packet_size=1500, bits=12, retakes=12, resend=False)
     with aravis.open("camera", config, patient_clock()) as camera:
@@ -88,7 +88,7 @@ def test_two_percent_of_packets_lost_costs_time_and_nothing_else(scene: Scene, s
 
 @pytest.mark.parametrize("pause_s", [0.9, 0.3])
 def test_a_stray_exposure_before_the_trigger_is_not_taken_for_its_own(
-    scene: Scene, simulated: GigeCamera, camera: aravis.AravisCamera, pause_s: float
+    scene: LightScene, simulated: GigeCamera, camera: aravis.AravisCamera, pause_s: float
 ) -> None:
     # 0.9 s: its frame waits when the trigger comes. 0.3 s: it still exposes then.
     camera.configure(CameraSettings(exposure_s=0.6))
@@ -103,7 +103,7 @@ def test_a_stray_exposure_before_the_trigger_is_not_taken_for_its_own(
 
 
 def test_a_stray_frame_that_arrives_after_the_trigger_is_not_taken_for_its_own(
-    scene: Scene, simulated: GigeCamera, camera: aravis.AravisCamera
+    scene: LightScene, simulated: GigeCamera, camera: aravis.AravisCamera
 ) -> None:
     # Exposed 0.1 s before the trigger and delivered 0.2 s after it, when the frame asked for could be there: only the
     # camera's clock tells them apart.
@@ -144,7 +144,7 @@ def test_ctrl_c_gets_through_a_long_wait(simulated: GigeCamera) -> None:
 
 def test_an_address_holds_one_simulated_camera(simulated: GigeCamera) -> None:
     with pytest.raises(CameraError, match="another camera had it"):
-        GigeCamera("FAULT4", *SIZE, pixel_source(Scene()), wait_s=0.1).start()
+        GigeCamera("FAULT4", *SIZE, pixel_source(LightScene()), wait_s=0.1).start()
 
 
 def test_a_killed_program_holds_the_camera_for_seconds_only(simulated: GigeCamera) -> None:
@@ -163,7 +163,7 @@ def test_a_camera_of_a_running_program_is_busy(camera: aravis.AravisCamera) -> N
 
 def test_an_address_that_no_interface_has_is_named() -> None:
     with pytest.raises(CameraError, match=r"ip addr add 127\.9\.9\.9"):
-        GigeCamera("FAULT5", *SIZE, pixel_source(Scene()), address="127.9.9.9").start()
+        GigeCamera("FAULT5", *SIZE, pixel_source(LightScene()), address="127.9.9.9").start()
 
 
 def test_an_error_of_the_pixel_source_is_raised_and_its_frame_not_sent() -> None:

@@ -12,7 +12,7 @@ from drivers.axes import mmcore as mmcore_axis
 from drivers.camera import CameraSettings
 from drivers.errors import CommandRejected, FrameLost, MotionFailed, PortNotFound, SettingRefused, WrongDevice
 from drivers.serial_link import LineRegistry
-from simulators.clock import Clock, patient_clock
+from simulators.clock import FastClock, patient_clock
 from simulators.conformance import CameraConformance
 from simulators.conformance.axis_promises import AxisPromises
 from simulators.conformance.camera import CameraTwin, Show
@@ -92,7 +92,7 @@ class NoPort:
 @contextmanager
 def stage_in(core: Any, homed: bool = True, speed: float = FAST, **options: Any) -> Iterator[ServedAxes]:
     """A stage of the core with the motor behind it."""
-    clock = Clock(speed, base=patient_clock())
+    clock = FastClock(speed, base=patient_clock())
     low_deg, high_deg = options.get("limits_deg") or (None, None)
     axis = EmulatedAxis(clock, min_deg=low_deg, max_deg=high_deg, homed=homed, start_deg=0.0 if homed else 15.0)
     motor = MotorBehindTheCore([axis], clock, FaultSchedule())

@@ -13,7 +13,7 @@ from drivers.registry import device_kinds
 from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
 from drivers.sources import dc4100, manual
-from simulators.clock import Clock, patient_clock
+from simulators.clock import FastClock, patient_clock
 from simulators.conformance import SourceConformance
 from simulators.conformance.source import source_kinds
 from simulators.controllers.dc4100 import DC4100Emulator
@@ -52,7 +52,7 @@ def test_a_source_without_a_choice_says_so() -> None:
 
 @pytest.fixture
 def leds() -> Iterator[tuple[DC4100Emulator, str, LineRegistry]]:
-    emulator = DC4100Emulator(Clock(base=patient_clock()), wavelengths_nm=(455.0, 530.0, 660.0, None))
+    emulator = DC4100Emulator(FastClock(base=patient_clock()), wavelengths_nm=(455.0, 530.0, 660.0, None))
     port = PtyPort(emulator)
     with LineRegistry(clock=patient_clock()) as lines:
         yield emulator, port.path, lines
@@ -104,7 +104,7 @@ def test_a_level_out_of_range_and_an_led_that_cannot_be_on(leds: tuple[DC4100Emu
 
 @given(data=st.binary(max_size=300))
 def test_noise_at_the_emulator_switches_nothing_on_by_accident(data: bytes) -> None:
-    emulator = DC4100Emulator(Clock(base=patient_clock()))
+    emulator = DC4100Emulator(FastClock(base=patient_clock()))
     emulator.receive(data)
     emulator.receive(b"\nE?\r\nO? 2\r\n")
     output = emulator.take_output()

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from processing.storage.captures.capture import Capture
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.rig.controller_kinds import served_kinds
 from simulators.rig.rig import SimulatedRig
 from simulators.serial.emulator import Emulator
@@ -35,7 +35,7 @@ class CarriageReturnsOnly:
 
 @pytest.mark.parametrize("kind", ["esp301", "zaber-no-checksums"])
 def test_doctor_home_and_move_of_a_foreign_controller(acquire: Acquire, small_rig: Rig, kind: str) -> None:
-    emulator = served_kinds()[kind](ServeOptions(clock=Clock(100.0), limits_deg=(-180.0, 180.0)))
+    emulator = served_kinds()[kind](ServeOptions(clock=FastClock(100.0), limits_deg=(-180.0, 180.0)))
     served = CarriageReturnsOnly(emulator) if kind == "esp301" else emulator
     with PtyPort(served) as port:
         psg = {"kind": kind.partition("-")[0], "port": port.path}

@@ -17,7 +17,7 @@ from scipy.ndimage import binary_erosion
 
 from processing.campaign.captures import find_captures
 from processing.campaign.executors import executor
-from processing.campaign.run import PAPER, Campaign, CampaignResult
+from processing.campaign.run import PAPER, CampaignResult, ProcessedCampaign
 from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
@@ -55,7 +55,7 @@ def here(folder: Path, configs: Path, tmp_path_factory: pytest.TempPathFactory) 
     """The campaign worked out in this process."""
     files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
     with executor(1) as pool:
-        return Campaign(folder, tmp_path_factory.mktemp("here"), *files).run(pool)
+        return ProcessedCampaign(folder, tmp_path_factory.mktemp("here"), *files).run(pool)
 
 
 def options(configs: Path) -> list[object]:
@@ -228,7 +228,7 @@ def test_a_cluster_gives_the_same_numbers(folder, here, configs, tmp_path):
     settings = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
     settings |= {"protocol": "tcp", "host": "127.0.0.1"}
     with distributed.LocalCluster(**settings) as cluster, executor(scheduler=cluster.scheduler_address) as pool:
-        there = Campaign(folder, tmp_path, *files).run(pool)
+        there = ProcessedCampaign(folder, tmp_path, *files).run(pool)
     assert here.rows == there.rows
 
 
@@ -285,8 +285,8 @@ def test_registering_finds_a_sphere_that_the_geometry_file_misses(folder, config
     wrong.write_text(text.replace("focal_length_mm: 60", "focal_length_mm: 61.5, centre_px: [1040.0, 1200.0]"))
     material = configs / "materials/red_print.yaml"
     with executor(1) as pool:
-        off = Campaign(folder, tmp_path / "a", wrong, material).run(pool)
-        found = Campaign(folder, tmp_path / "b", wrong, material, register=True).run(pool)
+        off = ProcessedCampaign(folder, tmp_path / "a", wrong, material).run(pool)
+        found = ProcessedCampaign(folder, tmp_path / "b", wrong, material, register=True).run(pool)
     for worse, better in zip(off.rows, found.rows, strict=True):
         assert better.psi_deg < 0.6 * worse.psi_deg
     product = next((tmp_path / "a").glob("drr_60.mueller.h5"))
@@ -377,7 +377,7 @@ def test_what_cannot_be_a_campaign_is_refused(folder, configs, tmp_path):
     (tmp_path / "drr_60.h5").write_bytes((folder / "drr_35.h5").read_bytes())
     files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
     with executor(1) as pool, pytest.raises(ProcessError, match="are both"):
-        Campaign(tmp_path, tmp_path / "out", *files).run(pool)
+        ProcessedCampaign(tmp_path, tmp_path / "out", *files).run(pool)
 
 
 def test_of_two_modes_or_samples_at_one_angle_the_user_chooses(folder, configs, process, tmp_path):

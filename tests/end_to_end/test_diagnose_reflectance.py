@@ -117,7 +117,7 @@ def test_what_acquire_writes_in_stokes_mode_is_enough(acquire, small_rig, config
 
 def test_geometry_and_instrument_that_were_found_end_the_error(configs, scene, tmp_path, capsys):
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
-    moved = scene_faults.ArmZero(scene_faults.moved_sphere(scene, 0.5, -0.3, 0.02), 2.0)
+    moved = scene_faults.ArmZeroFault(scene_faults.moved_sphere(scene, 0.5, -0.3, 0.02), 2.0)
     fault = SphereFault("three", moved, scene_faults.turned_generator(declared, 1.5), scene.material)
     path, new = tmp_path / "c.h5", tmp_path / "new.yaml"
     take(path, fault, declared, NM, omega_deg=OMEGA_DEG, seed=3)

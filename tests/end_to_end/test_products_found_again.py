@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from processing.campaign.executors import executor
-from processing.campaign.run import Campaign
+from processing.campaign.run import ProcessedCampaign
 from processing.commands.application import main
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
@@ -225,7 +225,7 @@ def test_campaign_makes_nothing_twice_and_takes_nothing_for_another(original, co
 
     def run() -> dict[str, bytes]:
         with executor(1) as pool:
-            Campaign(folder, out, *files).run(pool)
+            ProcessedCampaign(folder, out, *files).run(pool)
         return {path.name: path.read_bytes() for path in out.glob("*.mueller*.h5") if "table" not in path.name}
 
     first = run()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel, SystematicError
-from simulators.blind.bench_judge import WIRING_WORDS, Judgement, names_of, told_of, wiring_of
+from simulators.blind.bench_judge import WIRING_WORDS, BenchJudgement, names_of, told_of, wiring_of
 from simulators.blind.bench_oracle import known_oracle
 from simulators.blind.bench_run import judge_bench
 from simulators.blind.bench_table import MATTERS, is_worse, reliability, sure_and_wrong, table
@@ -25,7 +25,7 @@ from simulators.blind.real_bench import (
     read_truth,
 )
 from simulators.blind.reliability_diagram import draw
-from simulators.blind.undeclared_captures import Scene, declared_bench, digitize, expose, state_angles
+from simulators.blind.undeclared_captures import TrueScene, declared_bench, digitize, expose, state_angles
 
 SMALL = 24
 #: Of a bench whose sources drift and flicker.
@@ -131,7 +131,7 @@ def test_every_fault_changes_what_a_capture_file_says(group, kind, configs):
     def stored(faults):
         bench = declared_bench(model, 662.0, 16, mosaic, electrons=15_000.0)
         truths = [fault(bench, np.random.default_rng(3), polarimeter.states) for fault in faults]
-        light = expose(bench, Scene(np.random.default_rng(4)), angles)
+        light = expose(bench, TrueScene(np.random.default_rng(4)), angles)
         told = angles
         for change in bench.recorded:
             told = change(told)
@@ -246,7 +246,7 @@ def test_sentence_about_wiring_has_to_say_what_is_wrong():
 
 
 def test_table_counts_what_is_worse_and_what_is_sure_and_wrong(tmp_path):
-    good = Judgement(
+    good = BenchJudgement(
         "a", "real", "joint", "explained", 2.0, 4e-3, 1e-3, 0.9e-3, {"air": (3e-3, 1e-3)}, 0.95, 0.95, True
     )
     truth = truth_of(TrueFault("source_drift", "", {}, "air", {"air": 2.0}))

@@ -33,7 +33,7 @@ from acquisition.stop_request import StopRequest
 from drivers import genicam
 from drivers.camera import Frame
 from drivers.errors import DeviceError
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import CountCorrection
 from processing.storage.captures.capture import Capture
 
 TOP = 4095
@@ -182,7 +182,7 @@ def take(kind: str, seed: int, folder: Path) -> tuple[bool, bool, bool, bool]:
         told = [text for text in capture.closing.get("messages", []) if "false frame" in text]
         warned = bool(capture.closing.get("evidence"))
         if error is None:
-            warned = any("state" in text for text in Correction.of(capture).warnings)
+            warned = any("state" in text for text in CountCorrection.of(capture).warnings)
     return error is not None, false.retakes > 0, bool(told), warned
 
 

@@ -37,7 +37,7 @@ import processing.reflectance.material_fit  # noqa: F401
 from acquisition.commands.application import main as acquire
 from acquisition.commands.custody import verify
 from processing.storage.captures.capture import Capture, CaptureError
-from simulators.disc.power_cut import Disc, read_record
+from simulators.disc.power_cut import UnreliableDisc, read_record
 from simulators.disc.watched import RECORD, DiscCalls, build, restart_watched
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -251,7 +251,7 @@ def power(options: list[str], cuts: int, seed: int = 1) -> int:
     calls = list(read_record(record))
     chance = random.Random(seed)
     chosen = sorted(chance.choices(range(1, len(calls) + 1), k=cuts)) if cuts else list(range(1, len(calls) + 1))
-    disc, done, reported, lost, worst, opened = Disc(), 0, 0, 0, 0, 0
+    disc, done, reported, lost, worst, opened = UnreliableDisc(), 0, 0, 0, 0, 0
     for end in chosen:
         for call in calls[done:end]:
             disc.apply(call)

@@ -177,11 +177,11 @@ def served(work: Path, *, cutoff: bool) -> Iterator[tuple[SimulatedRig, Path]]:
     )
     with serve(rig, work / "served.yaml", "red_sphere") as simulation:
         if cutoff:
-            from simulators.clock import Clock, patient_clock
+            from simulators.clock import FastClock, patient_clock
             from simulators.controllers.i7000 import I7060Emulator
             from simulators.serial.pty_port import PtyPort
 
-            simulation.emulators["relay"] = relay = I7060Emulator(Clock(1.0, base=patient_clock()))
+            simulation.emulators["relay"] = relay = I7060Emulator(FastClock(1.0, base=patient_clock()))
             with PtyPort(relay) as port, (work / "served.yaml").open("a") as file:
                 file.write(f"cutoff: {{kind: i7000, port: {port.path}, watchdog_s: 1.0}}\n")
                 file.flush()

@@ -17,7 +17,7 @@ from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
 from processing.commands.application import main
 from processing.diagnosis.captured.read_capture import read_capture
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import CountCorrection
 from processing.storage.captures.capture import Capture
 from processing.storage.integrity.checksums import state_crc32, summed_values
 from processing.storage.products.product import Product
@@ -300,7 +300,7 @@ def test_frames_that_were_frozen_are_found_in_the_file_itself(run_with):
             h5["entry/states/crc32"][state] = state_crc32(sums[state], values)
     with Capture(path) as capture:
         assert not capture.damaged_states()
-        (text,) = [text for text in Correction.of(capture).warnings if "pixel by pixel" in text]
+        (text,) = [text for text in CountCorrection.of(capture).warnings if "pixel by pixel" in text]
         assert "14 states have the frame of state 29" in text
         assert text in read_capture(capture, capture.instrument).evidence
 

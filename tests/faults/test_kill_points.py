@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from simulators.disc.power_cut import Disc, read_record
+from simulators.disc.power_cut import UnreliableDisc, read_record
 from simulators.disc.watched import compiler
 
 PROGRAM = Path(__file__).with_name("kill_points.py")
@@ -49,7 +49,7 @@ def test_the_disc_keeps_what_was_synced_and_only_that(tmp_path):
         b"sync\t/a/x\t0\t0\nsync\t/a\t0\t0\nwrite\t/a/x\t2\t2\n!!"
         b"rename\t/a/x\t0\t4\n/a/ymkdir\t/b\t0\t0\ncreate\t/b/z\t0\t0\nsync\t/b\t0\t0\n"
     )
-    disc = Disc()
+    disc = UnreliableDisc()
     for call in read_record(record):
         disc.apply(call)
     assert disc.after_power_cut(None) == {"/a/x": b"safe"}

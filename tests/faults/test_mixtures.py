@@ -15,7 +15,7 @@ from acquisition.errors import Differs
 from acquisition.rig.config import load_rig
 from drivers.camera import CameraSettings
 from drivers.errors import DeviceError
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import CountCorrection
 from processing.reports.report import write_report
 from processing.storage.captures.capture import Capture
 from tests.rig_files import with_values
@@ -171,7 +171,7 @@ def test_a_resume_is_a_recorded_segment_and_nothing_is_forgotten(run_with, tmp_p
         closing = capture.closing
         assert [*first.states, *second.states] == list(range(19))
         assert list(capture.run_of_states) == [0] * len(first.states) + [1] * len(second.states)
-        assert any("taken in 2 runs" in text for text in Correction.of(capture).warnings)
+        assert any("taken in 2 runs" in text for text in CountCorrection.of(capture).warnings)
     assert (first.status, second.status) == ("failed", "complete")
     assert first.begun < first.ended <= second.begun < second.ended
     assert "process" in second.by

@@ -15,7 +15,7 @@ from processing.diagnosis.instrument_file import extended
 from processing.diagnosis.search.result import Check
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
-from processing.public_data.conversion import StateTable, mirror_means, single_detector, tables_of
+from processing.public_data.conversion import PublicStates, mirror_means, single_detector, tables_of
 from processing.public_data.sets import SHIPPED
 from processing.storage.captures.capture import Capture
 from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
@@ -23,7 +23,7 @@ from processing.storage.formats.importing import ImportRequest, import_capture, 
 pytestmark = pytest.mark.measured
 
 
-def imported(folder: Path, table: StateTable, instrument: Path) -> Path:
+def imported(folder: Path, table: PublicStates, instrument: Path) -> Path:
     out = folder / f"{table.name}.h5"
     import_capture(
         ImportRequest(

@@ -9,11 +9,19 @@ from processing.diagnosis.captured.read_capture import read_capture
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Sample
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, state_angles, write_capture
+from simulators.blind.undeclared_captures import TrueBench, TrueScene, digitize, expose, state_angles, write_capture
 
 
 def bench_capture(
-    folder: Path, file: Path, bench: Bench, air: bool = False, states: int = 40, seed: int = 7, *, scene=None, told=None
+    folder: Path,
+    file: Path,
+    bench: TrueBench,
+    air: bool = False,
+    states: int = 40,
+    seed: int = 7,
+    *,
+    scene=None,
+    told=None,
 ) -> Path:
     """A capture file of so many states of the instrument `file`: of air, which it tells, or of an unknown sample.
 
@@ -21,7 +29,7 @@ def bench_capture(
     """
     random = np.random.default_rng(seed)
     angles = state_angles(states, bench.mosaic, bench.zigzag)
-    seen = scene(random) if scene else Scene(random, np.eye(4) if air else None)
+    seen = scene(random) if scene else TrueScene(random, np.eye(4) if air else None)
     counts = digitize(bench, expose(bench, seen, angles), random)
     sample = Sample(kind="air" if air else "unknown")
     folder.mkdir(exist_ok=True)

@@ -13,7 +13,7 @@ from processing.diagnosis.captured.screening import without_steep_pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.space import Space
-from simulators.blind.undeclared_captures import Bench
+from simulators.blind.undeclared_captures import TrueBench
 
 SIGMA, SIDE = 2e-3, 3
 
@@ -59,7 +59,7 @@ def test_a_square_counts_if_all_its_pixels_do():
 @pytest.fixture(scope="module")
 def fitted(configs, tmp_path_factory):
     """Azimuth and image drift with their errors: of the pixels, and of means over them."""
-    bench = Bench(rows=96, columns=96)
+    bench = TrueBench(rows=96, columns=96)
     bench.oa += np.deg2rad(0.3)
     bench.shift.append(lambda k, a: (0.02 * k, -0.01 * k))
     file = configs / "instruments/rgb950.yaml"

@@ -9,7 +9,7 @@ from bench_capture import bench_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument.features import features
 from processing.instrument.model import InstrumentModel
-from simulators.blind.real_bench import Disc
+from simulators.blind.real_bench import RoundSample
 from simulators.blind.undeclared_captures import declared_bench
 
 STATES, PIXELS, NM = 40, 64, 662.0
@@ -25,7 +25,7 @@ def test_a_bend_beside_other_faults_is_not_taken_for_several(configs: Path, tmp_
     bench.path = (np.deg2rad(0.3), np.deg2rad(-0.4))
     bench.fast_slow_g = (1.0, 0.995)
     bench.level.append(lambda k, angles: 1 - 0.004 * k / STATES)
-    path = bench_capture(tmp_path, file, bench, seed=2, scene=Disc)
+    path = bench_capture(tmp_path, file, bench, seed=2, scene=RoundSample)
     found = diagnose_captures([path], InstrumentModel.load(file))[0].diagnosis
     told = {effect.kind: effect for effect in found.effects}
     assert set(told) == {"detector_nonlinearity", "retarder_diattenuation", "source_drift"}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from processing.calibration.known_sample import CalibrationError, Part
+from processing.calibration.known_sample import CalibrationError, KnownCapture
 from processing.calibration.train import fit_curves, fit_trains
 from processing.calibration.wavenumber_curve import WavenumberCurve
 from processing.commands.application import app
@@ -52,10 +52,10 @@ def light(wavelength_nm: float) -> np.ndarray:
     return ELECTRONS[wavelength_nm] * (plates().with_values(values).rows(ANGLES) @ np.eye(4).reshape(16))
 
 
-def parts_of(model: InstrumentModel, seed: int) -> list[Part]:
+def parts_of(model: InstrumentModel, seed: int) -> list[KnownCapture]:
     random = np.random.default_rng(seed)
     return [
-        Part(model.at(nm), ANGLES, random.poisson(light(nm)).astype(float), np.eye(4), wavelength_nm=nm)
+        KnownCapture(model.at(nm), ANGLES, random.poisson(light(nm)).astype(float), np.eye(4), wavelength_nm=nm)
         for nm in ELECTRONS
     ]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from processing.calibration.known_sample import Part, part_of
+from processing.calibration.known_sample import KnownCapture, part_of
 from processing.calibration.train import fit_trains
 from processing.commands.application import app
 from processing.instrument.model import InstrumentModel
@@ -93,5 +93,5 @@ def test_a_source_that_flickers_does_not_move_the_values_of_two_channels(configs
     true = model.with_values({"psg_retarder": {"azimuth_deg": 3.0}, "psa_retarder": {"retardance_deg": 94.0}})
     angles, random = {"psg": 4.0 * np.arange(46)}, np.random.default_rng(1)
     signal = true.rows(angles) @ np.eye(4).reshape(16) * random.uniform(0.8, 1.2, (46, 1))
-    (found,) = fit_trains([Part(model, angles, signal, np.eye(4))], ["psg_retarder.azimuth_deg", FREE[2]])
+    (found,) = fit_trains([KnownCapture(model, angles, signal, np.eye(4))], ["psg_retarder.azimuth_deg", FREE[2]])
     assert found.values == pytest.approx([3.0, 94.0], abs=1e-5)

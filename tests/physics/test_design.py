@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from processing.calibration.state_design import (
-    Noise,
+    AssumedNoise,
     equally_weighted_variance,
     optimize,
     read_table,
@@ -20,7 +20,7 @@ from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 
-NOISE = Noise(electrons=20_000, read_noise_e=3)
+NOISE = AssumedNoise(electrons=20_000, read_noise_e=3)
 MODEL = InstrumentModel.load(Path(__file__).parents[2] / "configs/instruments/rgb950.yaml").at(662)
 BOTH_127 = np.deg2rad(127.0), np.deg2rad(127.0)
 
@@ -99,7 +99,7 @@ def test_what_cannot_be_designed(configs: Path, tmp_path: Path) -> None:
     with pytest.raises(ProcessError, match="turning elements: psa_retarder, analyzer"):
         optimize(other, NOISE, [40], {}, ratio=4.91)
     with pytest.raises(ProcessError, match="positive signal"):
-        Noise(0, 3)
+        AssumedNoise(0, 3)
     table = tmp_path / "states.csv"
     table.write_text("psg,psa\n0,0\n9,x\n")
     with pytest.raises(ProcessError, match="state line 3: column 'psa' holds no number"):

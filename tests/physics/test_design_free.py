@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 from processing.calibration.free_angles import Cost, Goal, bound_of, free_design
 from processing.calibration.motor_time import Speed, front, move_seconds, ordered, periods_deg
 from processing.calibration.robustness import errors_of_table
-from processing.calibration.state_design import Noise, score
+from processing.calibration.state_design import AssumedNoise, score
 from processing.commands.application import app
 from processing.errors import ProcessError
 from processing.instrument.determined import determined_basis
@@ -50,7 +50,7 @@ def test_a_stokes_polarimeter_is_scored_by_what_it_determines(stokes):
     # The generator sends (1, 0, 0, 0), and a plate of 131.8 degrees covers the sphere evenly: 40 / 8.
     assert found.bound == pytest.approx(bound_of(stokes, 8)) == pytest.approx(5.0)
     assert found.variance < 1.01 * found.bound
-    said = score(stokes.rows(found.angles_deg), Noise(20_000, 3), basis, found.bound)
+    said = score(stokes.rows(found.angles_deg), AssumedNoise(20_000, 3), basis, found.bound)
     assert (said.rank, said.wanted) == (4, 4)
     assert np.isfinite(said.element_stderr[:, 0]).all()
     assert np.isnan(said.element_stderr[:, 1:]).all()
@@ -60,7 +60,7 @@ def test_a_stokes_polarimeter_is_scored_by_what_it_determines(stokes):
 
 def test_gradient_of_the_cost(rgb950):
     random = np.random.default_rng(1)
-    cost = Cost(rgb950, 20, Goal(Noise(500, 5)), ("psg_retarder", "psa_retarder"))
+    cost = Cost(rgb950, 20, Goal(AssumedNoise(500, 5)), ("psg_retarder", "psa_retarder"))
     x = np.concatenate([random.uniform(0, np.pi, 40), [2.3, 2.2]])
     _, gradient = cost(x)
     for k in (0, 7, 25, 40, 41):

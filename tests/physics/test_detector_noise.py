@@ -15,7 +15,7 @@ from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from simulators.blind.detector_cases import DETECTOR
-from simulators.blind.undeclared_captures import Bench
+from simulators.blind.undeclared_captures import TrueBench
 
 STATES = 40
 OPTICS = "instruments/rgb950.yaml"
@@ -23,7 +23,7 @@ OPTICS = "instruments/rgb950.yaml"
 
 @pytest.fixture
 def taken(tmp_path, configs):
-    def capture(bench: Bench, air: bool, states: int = STATES):
+    def capture(bench: TrueBench, air: bool, states: int = STATES):
         return bench_capture(tmp_path, configs / OPTICS, bench, air, states, seed=3)
 
     return capture
@@ -40,8 +40,8 @@ def read(path, configs) -> tuple[CaptureData, dict[str, float], float]:
     return data, tests, float(1 + fit.sums.excess.sum() / fit.sums.freedom.sum())
 
 
-def spoiled(name: str, seed: int, **bench) -> Bench:
-    out = Bench(**{"rows": 40, "columns": 40} | bench)
+def spoiled(name: str, seed: int, **bench) -> TrueBench:
+    out = TrueBench(**{"rows": 40, "columns": 40} | bench)
     if name in DETECTOR:
         DETECTOR[name](out, np.random.default_rng(seed), STATES)
     elif name == "row_noise_10_e":
@@ -94,7 +94,7 @@ def test_optics_are_judged_with_the_noise_that_is_found(taken, configs):
 
 def test_a_fault_of_the_optics_is_no_noise(taken, configs):
     """Not an image that wanders, a bent response, a source that flickers, or all of them."""
-    bench = Bench(rows=40, columns=40, og=np.deg2rad(-16.0))
+    bench = TrueBench(rows=40, columns=40, og=np.deg2rad(-16.0))
     bench.level.append(lambda k, a: 1 + 0.02 * np.sin(1.7 * k**2))
     bench.shift.append(lambda k, a: (0.4 * np.cos(a["psa"]), 0.4 * np.sin(a["psa"])))
     bench.transfer.append(lambda e: e - 3e-6 * e**2)

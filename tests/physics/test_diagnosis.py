@@ -17,8 +17,8 @@ from processing.diagnosis.search.result import Diagnosis, FoundEffect
 from processing.instrument.model import EffectParameter, InstrumentModel
 from processing.storage.captures.schema import Sample
 from simulators.blind.undeclared_captures import (
-    Bench,
-    Scene,
+    TrueBench,
+    TrueScene,
     declared_bench,
     digitize,
     expose,
@@ -29,7 +29,7 @@ from simulators.blind.undeclared_captures import (
 STATES = 40
 
 
-def capture(folder: Path, configs: Path, bench: Bench, air: bool, seed: int = 7) -> Path:
+def capture(folder: Path, configs: Path, bench: TrueBench, air: bool, seed: int = 7) -> Path:
     return bench_capture(folder, configs / "instruments/rgb950.yaml", bench, air, STATES, seed)
 
 
@@ -38,7 +38,7 @@ def diagnosed(path: Path, configs: Path) -> Diagnosis:
 
 
 def test_jones_bench_and_mueller_model_are_the_same_instrument(configs):
-    bench = Bench()
+    bench = TrueBench()
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
     angles = state_angles(STATES, False, False)
     g = np.stack([bench.generated({k: float(np.deg2rad(v[n])) for k, v in angles.items()}, n) for n in range(STATES)])
@@ -50,13 +50,13 @@ def test_jones_bench_and_mueller_model_are_the_same_instrument(configs):
 def test_a_retardance_error_is_invisible_with_an_unknown_sample_and_plain_with_air(configs, tmp_path):
     """docs/conventions.md, "What an unknown sample hides"."""
     wrong = np.deg2rad(127.12 + 1.0)
-    unknown = diagnosed(capture(tmp_path, configs, Bench(dg=wrong), air=False), configs)
+    unknown = diagnosed(capture(tmp_path, configs, TrueBench(dg=wrong), air=False), configs)
     assert unknown.verdict == "consistent"
     hidden = {"psg_retardance[psg_retarder]", "psa_retardance[psa_retarder]", "psg_extinction[psg_polarizer]"}
     assert hidden | {"stray_light"} <= set(unknown.unobservable)
     assert "air" in unknown.recommendation
     (tmp_path / "capture.h5").unlink()
-    air = diagnosed(capture(tmp_path, configs, Bench(dg=wrong), air=True), configs)
+    air = diagnosed(capture(tmp_path, configs, TrueBench(dg=wrong), air=True), configs)
     assert air.verdict == "explained"
     (effect,) = air.effects
     assert (effect.kind, effect.element) == ("psg_retardance", "psg_retarder")
@@ -67,7 +67,7 @@ def test_a_retardance_error_is_invisible_with_an_unknown_sample_and_plain_with_a
 
 def test_azimuths_of_analyzer_and_its_retarder_are_named_together(configs, tmp_path):
     """With an unknown sample the two cannot be told apart, and air is what separates them."""
-    d = diagnosed(capture(tmp_path, configs, Bench(oa=np.deg2rad(13.41 + 0.4)), air=False), configs)
+    d = diagnosed(capture(tmp_path, configs, TrueBench(oa=np.deg2rad(13.41 + 0.4)), air=False), configs)
     (effect,) = d.effects
     both = {effect.kind, *(text.partition("[")[0] for text in effect.indistinguishable_from)}
     assert both == {"psa_azimuth", "analyzer_azimuth"}
@@ -76,7 +76,7 @@ def test_azimuths_of_analyzer_and_its_retarder_are_named_together(configs, tmp_p
 
 def test_a_state_that_is_cut_off_at_zero_is_left_out(configs, tmp_path):
     """A black level that is too low for an offset; behind crossed polarizers nothing else is left."""
-    bench = Bench(rows=40, columns=40)
+    bench = TrueBench(rows=40, columns=40)
     bench.transfer.append(lambda e: e - 1100 * bench.gain)
     bench.angles.append(lambda k, a: a | {"psg": a["psg"] + np.deg2rad(0.4) * (k >= 26)})
     path = capture(tmp_path, configs, bench, air=True)
@@ -95,14 +95,14 @@ def test_a_state_that_is_cut_off_at_zero_is_left_out(configs, tmp_path):
 
 def test_nothing_wrong_is_consistent(configs, tmp_path):
     """What a pixel's residual shares with its own fit, through noise that differs from state to state, adds up."""
-    found = diagnosed(capture(tmp_path, configs, Bench(rows=400, columns=400), air=False, seed=4), configs)
+    found = diagnosed(capture(tmp_path, configs, TrueBench(rows=400, columns=400), air=False, seed=4), configs)
     assert found.verdict == "consistent"
     assert max(found.captures[0].tests_before.values()) < 4
 
 
 def test_random_gains_in_air_are_not_given_a_name(configs, tmp_path):
     """One known sample and one channel: a gain for each state explains anything, so it explains nothing."""
-    bench = Bench()
+    bench = TrueBench()
     gains = 1 + 0.01 * np.random.default_rng(3).standard_normal(STATES)
     bench.level.append(lambda k, a: float(gains[k]))
     d = diagnosed(capture(tmp_path, configs, bench, air=True), configs)
@@ -116,7 +116,7 @@ def test_random_gains_in_air_are_not_given_a_name(configs, tmp_path):
 
 def test_a_small_effect_beside_an_image_that_wanders_by_a_pixel(configs, tmp_path):
     """Second derivatives of the image leave more of such a shift than the other effect explains."""
-    bench = Bench(rows=32, columns=32, og=np.deg2rad(0.5))
+    bench = TrueBench(rows=32, columns=32, og=np.deg2rad(0.5))
     bench.shift.append(lambda k, a: (0.9 * np.cos(a["psg"]), 0.9 * np.sin(a["psg"])))
     path = capture(tmp_path, configs, bench, air=False)
     found = diagnosed(path, configs)
@@ -135,8 +135,8 @@ def test_a_small_effect_beside_an_image_that_wanders_by_a_pixel(configs, tmp_pat
 
 def test_a_shift_of_an_even_image_cannot_be_seen(configs, tmp_path):
     def unobservable(waves: float) -> set[str]:
-        random, bench = np.random.default_rng(7), Bench(rows=64, columns=64)
-        scene, angles = Scene(random), state_angles(STATES, False, False)
+        random, bench = np.random.default_rng(7), TrueBench(rows=64, columns=64)
+        scene, angles = TrueScene(random), state_angles(STATES, False, False)
         scene.waves *= waves
         path = tmp_path / f"waves{waves:g}.h5"
         counts = digitize(bench, expose(bench, scene, angles), random)
@@ -151,7 +151,7 @@ def test_a_shift_of_an_even_image_cannot_be_seen(configs, tmp_path):
 
 def test_a_second_effect_beside_a_retardance_that_varies_over_the_image(configs, tmp_path):
     """Every tile has a matrix of its own then, and the counts are corrected all the same."""
-    bench = Bench(rows=40, columns=40)
+    bench = TrueBench(rows=40, columns=40)
     x = np.linspace(-1, 1, 40)
     bench.field_retardance = np.deg2rad(np.broadcast_to(1.5 * x, (40, 40)))
     bench.shift.append(lambda k, a: (0.8 * (k / (STATES - 1) - 0.5), 0.0))
@@ -172,7 +172,7 @@ def test_shifts_on_a_mosaic_are_told_in_pixels_of_the_sensor(configs, tmp_path):
     bench = declared_bench(model.at(nm), nm, 64, mosaic=True, electrons=20_000.0)
     bench.shift.append(lambda k, a: (1.2 * (k / 15 - 0.5), -0.7 * (k / 15 - 0.5)))
     angles = {"psg": state_angles(16, True, False)["psg"]}
-    counts = digitize(bench, expose(bench, Scene(random), angles), random)
+    counts = digitize(bench, expose(bench, TrueScene(random), angles), random)
     path = tmp_path / "capture.h5"
     write_capture(path, bench, counts, angles, sample=Sample(kind="unknown"), instrument=file.read_text())
     (effect,) = diagnose_captures([path], model)[0].diagnosis.effects
@@ -184,7 +184,7 @@ def test_shifts_on_a_mosaic_are_told_in_pixels_of_the_sensor(configs, tmp_path):
 
 
 def test_what_changes_in_a_part_of_the_image_is_no_source(configs, tmp_path):
-    bench = Bench(rows=40, columns=40)
+    bench = TrueBench(rows=40, columns=40)
     bench.material_level.append((0, lambda k: 1 + 0.15 * (1 - np.exp(-3 * k / STATES))))
     found = diagnosed(capture(tmp_path, configs, bench, air=True), configs)
     assert not [e for e in found.effects if e.confident]
@@ -192,7 +192,7 @@ def test_what_changes_in_a_part_of_the_image_is_no_source(configs, tmp_path):
 
 
 def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, capsys):
-    path = capture(tmp_path, configs, Bench(dg=np.deg2rad(129.0)), air=True)
+    path = capture(tmp_path, configs, TrueBench(dg=np.deg2rad(129.0)), air=True)
     instrument, new = configs / "instruments/rgb950.yaml", tmp_path / "new.yaml"
     report, out = tmp_path / "report.html", tmp_path / "out.json"
     call = [str(path), "--instrument", str(instrument), "--write", str(new)]
@@ -233,7 +233,7 @@ def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, c
 
 
 def test_an_instrument_file_that_is_larger_than_what_is_read_is_not_written(configs, tmp_path, monkeypatch):
-    path = capture(tmp_path, configs, Bench(rows=8, columns=8, dg=np.deg2rad(129.0)), air=True)
+    path = capture(tmp_path, configs, TrueBench(rows=8, columns=8, dg=np.deg2rad(129.0)), air=True)
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     found = diagnosed(path, configs)
     monkeypatch.setattr(yaml_file, "MOST_BYTES", 1000)

@@ -12,7 +12,7 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.search.rules import NEEDED
 from processing.diagnosis.search.space import Space
-from simulators.blind.undeclared_captures import Bench
+from simulators.blind.undeclared_captures import TrueBench
 
 SIDE = 24
 
@@ -25,7 +25,7 @@ def captured(folder, configs, bench):
 
 @pytest.mark.parametrize("leaks", [True, False])
 def test_light_that_leaks_scatters_and_an_offset_does_not(configs, tmp_path, leaks):
-    bench = Bench(rows=SIDE, columns=SIDE, electrons=600.0)
+    bench = TrueBench(rows=SIDE, columns=SIDE, electrons=600.0)
     if leaks:
         bench.extinction_a = 0.1
     else:
@@ -42,7 +42,7 @@ def test_light_that_leaks_scatters_and_an_offset_does_not(configs, tmp_path, lea
 @pytest.mark.parametrize("size", [-0.05, 0.05])
 def test_counts_scatter_as_the_bend_says_that_made_them(configs, tmp_path, size):
     """A bend stretches the photon noise with the counts, whether it compresses them or not."""
-    bench = Bench(rows=2 * SIDE, columns=2 * SIDE, electrons=9000.0)
+    bench = TrueBench(rows=2 * SIDE, columns=2 * SIDE, electrons=9000.0)
     bench.transfer.append(lambda electrons: electrons * (1 - size * electrons / 10_000))
     model, data = captured(tmp_path, configs, bench)
     problem = InstrumentProblem(model, [data], folds=1)
@@ -53,7 +53,7 @@ def test_counts_scatter_as_the_bend_says_that_made_them(configs, tmp_path, size)
 
 
 def test_what_a_fit_leaves_of_the_optics_is_no_noise(configs, tmp_path):
-    bench = Bench(rows=SIDE, columns=SIDE, electrons=6000.0)
+    bench = TrueBench(rows=SIDE, columns=SIDE, electrons=6000.0)
     bench.dg += np.deg2rad(15)
     model, data = captured(tmp_path, configs, bench)
     problem = InstrumentProblem(model, [data], folds=1)
@@ -64,7 +64,7 @@ def test_what_a_fit_leaves_of_the_optics_is_no_noise(configs, tmp_path):
 
 @pytest.mark.parametrize("stated", [True, False])
 def test_noise_follows_the_light_unless_it_is_stated(configs, tmp_path, stated):
-    bench = Bench(rows=SIDE, columns=SIDE, electrons=6000.0)
+    bench = TrueBench(rows=SIDE, columns=SIDE, electrons=6000.0)
     bench.stored.append(lambda counts: counts + 400)
     model, data = captured(tmp_path, configs, bench)
     if stated:
@@ -75,7 +75,7 @@ def test_noise_follows_the_light_unless_it_is_stated(configs, tmp_path, stated):
 
 
 def test_the_noise_of_light_that_does_not_scatter_so_is_not_taken(configs, tmp_path):
-    model, data = captured(tmp_path, configs, Bench(rows=SIDE, columns=SIDE, electrons=6000.0))
+    model, data = captured(tmp_path, configs, TrueBench(rows=SIDE, columns=SIDE, electrons=6000.0))
     problem = InstrumentProblem(model, [data], folds=1)
     bend = next(c for c in problem.pool() if c.kind == "detector_nonlinearity")
     before = problem.moments[0].sigma
@@ -84,7 +84,7 @@ def test_the_noise_of_light_that_does_not_scatter_so_is_not_taken(configs, tmp_p
 
 
 def test_pixels_at_an_edge_are_left_out_and_those_of_a_slope_are_not(configs, tmp_path):
-    _, data = captured(tmp_path, configs, Bench(rows=SIDE, columns=SIDE))
+    _, data = captured(tmp_path, configs, TrueBench(rows=SIDE, columns=SIDE))
 
     def left(image):
         return without_steep_pixels(replace(data, signal=np.broadcast_to(image, data.signal.shape).astype(np.float32)))
@@ -108,7 +108,7 @@ def test_pixels_at_an_edge_are_left_out_and_those_of_a_slope_are_not(configs, tm
 
 def test_a_mean_that_only_its_linearization_explains_is_not_taken(configs, tmp_path, monkeypatch):
     """The search with the noise of the light ends far off in a capture of air: what was found before it stays."""
-    bench = Bench(rows=SIDE, columns=SIDE, electrons=6000.0)
+    bench = TrueBench(rows=SIDE, columns=SIDE, electrons=6000.0)
     bench.ellipticity = np.deg2rad(3.0)
     model, data = captured(tmp_path, configs, bench)
     whole = WholeBench(InstrumentProblem(model, [data], folds=2), lambda step: None)

@@ -13,24 +13,31 @@ from processing.instrument.grammar import sentences as sentences_of
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.schema import Sample
 from simulators.blind.outside_list import ghost, image_lag, lamp_jump
-from simulators.blind.real_bench import Disc
-from simulators.blind.undeclared_captures import Bench, declared_bench, digitize, expose, state_angles, write_capture
+from simulators.blind.real_bench import RoundSample
+from simulators.blind.undeclared_captures import (
+    TrueBench,
+    declared_bench,
+    digitize,
+    expose,
+    state_angles,
+    write_capture,
+)
 from simulators.blind.undeclared_faults import busy_machine, etalon, lamp_beat
 
 STATES, PIXELS, NM = 40, 32, 662.0
 
 
 @pytest.fixture
-def bench(configs: Path) -> Bench:
+def bench(configs: Path) -> TrueBench:
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
     return declared_bench(model, NM, PIXELS, False, electrons=20_000.0)
 
 
-def diagnosed(folder: Path, configs: Path, bench: Bench, drift_counts: float = 0.0) -> Diagnosis:
+def diagnosed(folder: Path, configs: Path, bench: TrueBench, drift_counts: float = 0.0) -> Diagnosis:
     """A bright disc before a dark background, of unknown Mueller matrix; the black level may drift."""
     file, random = configs / "instruments/rgb950.yaml", np.random.default_rng(4)
     angles = state_angles(STATES, False, False)
-    counts = digitize(bench, expose(bench, Disc(random), angles), random)
+    counts = digitize(bench, expose(bench, RoundSample(random), angles), random)
     moved = np.round(np.linspace(0, drift_counts, STATES)).reshape(-1, *(1,) * (counts.ndim - 1))
     counts = (counts + moved).astype(counts.dtype)
     path = folder / "capture.h5"

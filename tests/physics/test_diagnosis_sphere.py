@@ -74,7 +74,7 @@ def test_what_is_wrong_gets_its_name(scene, declared, tmp_path, kind):
 
 def test_arm_zero_and_registration_cannot_be_told_apart_by_linear_stokes(scene, configs, tmp_path):
     declared = InstrumentModel.load(configs / "instruments/linear_stokes.yaml")
-    fault = SphereFault("arm_zero", scene_faults.ArmZero(scene, 2.0), declared, scene.material)
+    fault = SphereFault("arm_zero", scene_faults.ArmZeroFault(scene, 2.0), declared, scene.material)
     d, _ = diagnosed(tmp_path, fault, declared, scene)
     (effect,) = d.effects
     named = {effect.kind, *(i.partition("[")[0] for i in effect.indistinguishable_from)}
@@ -82,7 +82,7 @@ def test_arm_zero_and_registration_cannot_be_told_apart_by_linear_stokes(scene, 
     assert "outline" in d.recommendation
     # A full Mueller capture with the same light sees the angle of incidence at each facet, and so the arm itself.
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
-    fault = SphereFault("arm_zero", scene_faults.ArmZero(scene, 2.0), declared, scene.material)
+    fault = SphereFault("arm_zero", scene_faults.ArmZeroFault(scene, 2.0), declared, scene.material)
     d, _ = diagnosed(tmp_path, fault, declared, scene)
     (effect,) = d.effects
     assert (effect.kind, effect.indistinguishable_from) == ("arm_zero", ())
@@ -110,7 +110,7 @@ def test_what_is_not_in_the_list_gets_no_name(scene, configs, tmp_path, kind):
 
 def test_two_effects_at_once(scene, configs, tmp_path):
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
-    both = scene_faults.ArmZero(scene, 2.0)
+    both = scene_faults.ArmZeroFault(scene, 2.0)
     fault = SphereFault("two", both, scene_faults.turned_generator(declared, 1.0), scene.material)
     d, _ = diagnosed(tmp_path, fault, declared, scene)
     found = {e.kind: next(iter(e.parameters.values())) for e in d.effects}

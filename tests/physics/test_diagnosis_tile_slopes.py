@@ -14,7 +14,7 @@ from processing.diagnosis.instrument.tiles import features_of_tiles, tile_column
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import FIELD_TERMS
 from processing.instrument.model import AppliedEffect, EffectParameter
-from simulators.blind.undeclared_captures import Bench
+from simulators.blind.undeclared_captures import TrueBench
 
 KINDS = ("field_retardance", "psg_retardance", "rotation_eccentricity", "retarder_diattenuation", "stray_light")
 KINDS_OF_COUNTS = ("detector_offset", "beam_wander")
@@ -23,7 +23,7 @@ KINDS_OF_COUNTS = ("detector_offset", "beam_wander")
 @pytest.fixture(scope="module")
 def problem(configs, tmp_path_factory):
     file = configs / "instruments/rgb950.yaml"
-    path = bench_capture(tmp_path_factory.mktemp("tiles"), file, Bench(rows=32, columns=32), seed=3)
+    path = bench_capture(tmp_path_factory.mktemp("tiles"), file, TrueBench(rows=32, columns=32), seed=3)
     model, data = read(path, file)
     return InstrumentProblem(model, [data])
 

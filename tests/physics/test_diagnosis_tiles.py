@@ -14,13 +14,13 @@ from processing.diagnosis.instrument.tiles import TileSlopes, add_tiles, feature
 from processing.diagnosis.search.rules import FOLDS_OF_TILES
 from processing.diagnosis.search.space import Sums
 from processing.instrument.changes import Changes, field_terms
-from simulators.blind.undeclared_captures import Bench
+from simulators.blind.undeclared_captures import TrueBench
 
 
 @pytest.fixture(scope="module")
 def seen(configs, tmp_path_factory):
     file = configs / "instruments/rgb950.yaml"
-    path = bench_capture(tmp_path_factory.mktemp("tiles"), file, Bench(rows=32, columns=32), seed=3)
+    path = bench_capture(tmp_path_factory.mktemp("tiles"), file, TrueBench(rows=32, columns=32), seed=3)
     model, data = read(path, file)
     return model, data, moments_of(data, FOLDS_OF_TILES)
 

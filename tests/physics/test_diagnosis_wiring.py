@@ -8,7 +8,7 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.instrument.wiring import miswired, miswired_train
 from processing.instrument.model import InstrumentModel
-from simulators.blind.undeclared_captures import Bench
+from simulators.blind.undeclared_captures import TrueBench
 
 
 def problem(folder, configs, bench, told, air):
@@ -33,7 +33,7 @@ def problem(folder, configs, bench, told, air):
 )
 def test_a_mistake_is_told(configs, tmp_path, told, word, air):
     # Beside small faults of the optics, which are no mistake.
-    bench = Bench(dg=np.deg2rad(128.0), lp=np.deg2rad(-0.2))
+    bench = TrueBench(dg=np.deg2rad(128.0), lp=np.deg2rad(-0.2))
     found = miswired(problem(tmp_path, configs, bench, told, air))
     assert found is not None
     assert word in found.told
@@ -42,7 +42,7 @@ def test_a_mistake_is_told(configs, tmp_path, told, word, air):
 @pytest.mark.parametrize("air", [True, False])
 @pytest.mark.parametrize("degrees", [0.0, 1.0, 10.0])
 def test_what_is_no_mistake_is_not_called_one(configs, tmp_path, air, degrees):
-    bench = Bench(og=np.deg2rad(-17.02 + degrees), dg=np.deg2rad(127.12 + degrees))
+    bench = TrueBench(og=np.deg2rad(-17.02 + degrees), dg=np.deg2rad(127.12 + degrees))
     bench.level.append(lambda k, a: 1 + 0.02 * np.sin(k))
     assert miswired(problem(tmp_path, configs, bench, lambda a: a, air)) is None
 
@@ -50,7 +50,7 @@ def test_what_is_no_mistake_is_not_called_one(configs, tmp_path, air, degrees):
 @pytest.mark.parametrize("degrees", [18.0, 22.0])
 def test_a_plate_that_is_far_off_is_no_other_wavelength(configs, tmp_path, degrees):
     """Its retardance is nearer to the one at 524 nm: that would leave a third of the residual, the plate nothing."""
-    bench = Bench(da=np.deg2rad(94.78 + degrees))
+    bench = TrueBench(da=np.deg2rad(94.78 + degrees))
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     assert miswired(problem(tmp_path, configs, bench, lambda a: a, True), declared) is None
 
@@ -58,7 +58,7 @@ def test_a_plate_that_is_far_off_is_no_other_wavelength(configs, tmp_path, degre
 @pytest.mark.parametrize("air", [True, False])
 def test_the_filter_of_another_wavelength_is_told(configs, tmp_path, air):
     # The plates of this bench have the retardances of 451 nm; the file says 662.
-    bench = Bench(dg=np.deg2rad(130.01), da=np.deg2rad(143.13))
+    bench = TrueBench(dg=np.deg2rad(130.01), da=np.deg2rad(143.13))
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     found = miswired(problem(tmp_path, configs, bench, lambda a: a, air), declared)
     if not air:
@@ -72,7 +72,7 @@ def test_the_filter_of_another_wavelength_is_told(configs, tmp_path, air):
 
 def test_a_mistake_is_told_where_the_train_has_nominal_values(configs, tmp_path):
     """Azimuths and retardances that `calibrate` leaves open do not mend an axis that turns the other way."""
-    bench = Bench(rows=9, columns=9, og=np.deg2rad(-3.0), dg=np.deg2rad(120.0), oa=np.deg2rad(30.0))
+    bench = TrueBench(rows=9, columns=9, og=np.deg2rad(-3.0), dg=np.deg2rad(120.0), oa=np.deg2rad(30.0))
     whole = problem(tmp_path, configs, bench, lambda a: a | {"psa": -a["psa"]}, air=True)
     nominal = ("psg_retarder.azimuth_deg", "psg_retarder.retardance_deg", "psa_retarder.azimuth_deg")
     whole.models = tuple(m.model_copy(update={"calibrate": nominal}) for m in whole.models)

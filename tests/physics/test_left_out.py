@@ -21,12 +21,12 @@ from processing.storage.products.pixel_mask import Mask
 from processing.storage.products.product import Product
 from processing.yaml_file import dump_yaml
 from simulators.blind.detector_cases import DETECTOR
-from simulators.blind.undeclared_captures import Bench, state_angles
+from simulators.blind.undeclared_captures import TrueBench, state_angles
 
 STATES, SIDE = 46, 40
 
 
-def taken(folder: Path, configs: Path, bench: Bench, seed: int, air: bool) -> Path:
+def taken(folder: Path, configs: Path, bench: TrueBench, seed: int, air: bool) -> Path:
     return bench_capture(folder, configs / "instruments/rgb950.yaml", bench, air, STATES, seed)
 
 
@@ -36,7 +36,7 @@ def screened_capture(path: Path, configs: Path) -> CaptureData:
         return screened(read_capture(capture, model), model, lambda line: None)
 
 
-def small_faults(bench: Bench) -> None:
+def small_faults(bench: TrueBench) -> None:
     """A bench as it is: nothing quite where it should be, a source that is not quite steady, an image that wanders."""
     bench.og += np.deg2rad(0.5)
     bench.da += np.deg2rad(1.0)
@@ -46,7 +46,7 @@ def small_faults(bench: Bench) -> None:
 
 @pytest.mark.parametrize("air", [True, False])
 def test_nothing_is_left_out_of_a_bench_with_faults_of_the_optics(configs, tmp_path, air):
-    bench = Bench(rows=SIDE, columns=SIDE)
+    bench = TrueBench(rows=SIDE, columns=SIDE)
     small_faults(bench)
     assert not screened_capture(taken(tmp_path, configs, bench, 3, air), configs).left_out
 
@@ -54,7 +54,7 @@ def test_nothing_is_left_out_of_a_bench_with_faults_of_the_optics(configs, tmp_p
 @pytest.mark.parametrize("air", [True, False])
 @pytest.mark.parametrize("state", [0, 17])
 def test_a_frame_that_belongs_to_nothing_is_found_among_faults(configs, tmp_path, air, state):
-    bench = Bench(rows=SIDE, columns=SIDE)
+    bench = TrueBench(rows=SIDE, columns=SIDE)
     small_faults(bench)
     bench.level.append(lambda k, a: 0.75 if k == state else 1.0)
     found = screened_capture(taken(tmp_path, configs, bench, 3, air), configs)
@@ -67,7 +67,7 @@ def test_a_frame_that_belongs_to_nothing_is_found_among_faults(configs, tmp_path
 @pytest.mark.parametrize("pair", [(11, 12), (4, 30)])
 def test_two_frames_in_each_others_place_are_found_among_faults(configs, tmp_path, air, pair):
     """Gains and angles of single states would describe them, and be called by those names."""
-    bench = Bench(rows=SIDE, columns=SIDE)
+    bench = TrueBench(rows=SIDE, columns=SIDE)
     small_faults(bench)
     bench.order = np.arange(STATES)
     bench.order[list(pair)] = pair[::-1]
@@ -77,7 +77,7 @@ def test_two_frames_in_each_others_place_are_found_among_faults(configs, tmp_pat
 
 
 def test_cosmic_rays_and_hot_pixels_are_found_and_left_out(configs, tmp_path):
-    bench = Bench(rows=SIDE, columns=SIDE)
+    bench = TrueBench(rows=SIDE, columns=SIDE)
     small_faults(bench)
     truth = np.zeros((STATES, SIDE, SIDE), dtype=bool)
 
@@ -104,7 +104,7 @@ def test_cosmic_rays_and_hot_pixels_are_found_and_left_out(configs, tmp_path):
 
 def test_hits_are_found_pixel_by_pixel_where_means_are_fitted(configs, tmp_path, monkeypatch):
     monkeypatch.setattr(averaged, "MOST_FITTED", STATES * SIDE**2 // 4)
-    bench = Bench(rows=SIDE, columns=SIDE)
+    bench = TrueBench(rows=SIDE, columns=SIDE)
 
     def strike(electrons, random):
         electrons = electrons.copy()
@@ -122,7 +122,7 @@ def test_hits_are_found_pixel_by_pixel_where_means_are_fitted(configs, tmp_path,
 
 def test_cosmic_rays_are_found_where_it_is_dark(configs, tmp_path):
     """The noise of an intensity is that of its light, not that of what struck it."""
-    bench = Bench(rows=SIDE, columns=SIDE)
+    bench = TrueBench(rows=SIDE, columns=SIDE)
     bench.light.append(lambda k, e: np.where(np.arange(SIDE) < SIDE // 2, 0.004, 1.0) * e)
     struck = np.argwhere(np.random.default_rng(2).random((STATES, SIDE, SIDE // 2)) < 0.004)
 
@@ -149,7 +149,7 @@ def mean_error(image: MuellerImage, good: np.ndarray) -> float:
 
 @pytest.mark.parametrize("weighted", [False, True])
 def test_a_reduction_leaves_out_what_a_diagnosis_names(configs, tmp_path, weighted):
-    bench = Bench(rows=SIDE, columns=SIDE)
+    bench = TrueBench(rows=SIDE, columns=SIDE)
     DETECTOR["bad_frame"](bench, np.random.default_rng(2), STATES)
     path = taken(tmp_path, configs, bench, 5, air=True)
     result = tmp_path / "result.json"
@@ -168,7 +168,7 @@ def test_a_reduction_leaves_out_what_a_diagnosis_names(configs, tmp_path, weight
 
 
 def test_a_struck_intensity_does_not_count(configs, tmp_path):
-    path = taken(tmp_path, configs, Bench(rows=8, columns=8), 5, air=True)
+    path = taken(tmp_path, configs, TrueBench(rows=8, columns=8), 5, air=True)
     hits = np.array([[3, 0, 4, 5]])
     with Capture(path) as capture:
         model = capture.instrument
@@ -209,7 +209,7 @@ def test_stokes_of_a_mosaic_leave_out_states_and_struck_pixels(synthetic_capture
 def test_effects_count_the_states_that_a_diagnosis_saw(configs, tmp_path):
     """A slip from state 9 on, a level of the source in each state: without state 4 they stay where they are."""
     gains = 0.05 * np.random.default_rng(1).standard_normal(STATES)
-    bench = Bench(rows=8, columns=8)
+    bench = TrueBench(rows=8, columns=8)
     bench.angles.append(lambda k, a: a | {"psg": a["psg"] + np.deg2rad(2.0) * (k >= 9)})
     bench.level.append(lambda k, a: 1 + gains[k])
     path = taken(tmp_path, configs, bench, 5, air=True)

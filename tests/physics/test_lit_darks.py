@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.lit_darks import LitDarks
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Detector
@@ -106,7 +106,7 @@ def warned(synthetic_capture, dark: np.ndarray, light: np.ndarray, **header: obj
     header = {"detector": Detector(black_level_counts=BLACK), "mosaic": (("90", "45"), ("135", "0"))} | header
     path = synthetic_capture(counts, {"psg": np.zeros(4)}, role=roles, channels=("mosaic",), **header)
     with Capture(path) as capture:
-        return [text for text in Correction.of(capture).warnings if "dark" in text]
+        return [text for text in CountCorrection.of(capture).warnings if "dark" in text]
 
 
 def test_the_reduction_warns_of_darks_that_are_brighter_in_a_part_or_in_one_analyzer(synthetic_capture) -> None:
@@ -135,7 +135,7 @@ def test_the_reduction_warns(synthetic_capture) -> None:
     roles = ("dark", "dark", "sample", "sample", "sample")
     path = synthetic_capture(counts, {"psg": np.zeros(5)}, role=roles, channels=("mosaic",), **header)
     with Capture(path) as capture:
-        (warning,) = [text for text in Correction.of(capture).warnings if "as bright as" in text]
+        (warning,) = [text for text in CountCorrection.of(capture).warnings if "as bright as" in text]
         assert "light shut off" in warning
 
 

@@ -10,8 +10,8 @@ from processing.diagnosis.captured.screening import screened
 from processing.diagnosis.instrument.diagnose import diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.space import Space
-from simulators.blind.real_bench import Disc
-from simulators.blind.undeclared_captures import Bench
+from simulators.blind.real_bench import RoundSample
+from simulators.blind.undeclared_captures import TrueBench
 
 SIDE, STATES = 64, 40
 
@@ -31,7 +31,7 @@ def said(model, *captures):
 @pytest.mark.parametrize("times", [0.965, 1.04])
 def test_a_gain_that_is_stated_some_percent_wrong_hides_no_cause(configs, tmp_path, times):
     """Four percent of the variance of 160 000 intensities is eleven standard deviations of their sum of squares."""
-    bench = Bench(rows=SIDE, columns=SIDE)
+    bench = TrueBench(rows=SIDE, columns=SIDE)
     bench.dg += np.deg2rad(0.4)
     bench.ellipticity = np.deg2rad(0.5)
     bench.level.append(lambda k, a: 1 + 0.01 * k / (STATES - 1))
@@ -44,10 +44,10 @@ def test_a_gain_that_is_stated_some_percent_wrong_hides_no_cause(configs, tmp_pa
 
 def test_an_offset_is_no_other_read_noise(configs, tmp_path):
     """A ball before a dark wall: what is added to all counts takes photon noise along in what is expected of them."""
-    bench = Bench(rows=SIDE, columns=SIDE, read_noise=3.0)
+    bench = TrueBench(rows=SIDE, columns=SIDE, read_noise=3.0)
     bench.da += np.deg2rad(0.5)
     bench.stored.append(lambda counts: counts + 60)
-    model, ball = captured(tmp_path / "ball", configs, bench, Disc)
+    model, ball = captured(tmp_path / "ball", configs, bench, RoundSample)
     _, air = captured(tmp_path, configs, bench)
     told = []
     ball, air = (screened(d, model, told.append) for d in (ball, air))
@@ -59,9 +59,9 @@ def test_an_offset_is_no_other_read_noise(configs, tmp_path):
 
 def test_an_offset_that_nothing_else_shows_leaves_the_noise_of_the_light(configs, tmp_path):
     """Behind it the dark wall scatters otherwise than its counts say, and the ball as before."""
-    bench = Bench(rows=SIDE, columns=SIDE, read_noise=3.0)
+    bench = TrueBench(rows=SIDE, columns=SIDE, read_noise=3.0)
     bench.stored.append(lambda stored: stored + 60)
-    model, data = captured(tmp_path, configs, bench, Disc)
+    model, data = captured(tmp_path, configs, bench, RoundSample)
     problem, nothing = InstrumentProblem(model, [data]), Space(())
     problem.level_noise(nothing, np.zeros(0))
     (leveled,) = problem.still

@@ -13,7 +13,7 @@ from processing.diagnosis.search.space import Sums
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Sample
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, state_angles, write_capture
+from simulators.blind.undeclared_captures import TrueBench, TrueScene, digitize, expose, state_angles, write_capture
 
 STATES, ROWS, COLUMNS, NOISE = 12, 90, 70, 1e-3
 
@@ -82,9 +82,9 @@ def test_derivatives_of_a_part_are_those_of_the_image(capture):
 
 @pytest.mark.parametrize("side", [1, 2, 3])
 def test_squares_are_averaged_while_they_are_read(configs, tmp_path, monkeypatch, side):
-    bench, random = Bench(rows=31, columns=33), np.random.default_rng(2)
+    bench, random = TrueBench(rows=31, columns=33), np.random.default_rng(2)
     angles = state_angles(20, False, False)
-    counts = digitize(bench, expose(bench, Scene(random), angles), random)
+    counts = digitize(bench, expose(bench, TrueScene(random), angles), random)
     counts[4, 8:9, 11:12] = 2**16 - 1
     text = (configs / "instruments/rgb950.yaml").read_text()
     write_capture(tmp_path / "c.h5", bench, counts, angles, sample=Sample(kind="unknown"), instrument=text)

@@ -11,7 +11,7 @@ import pytest
 from processing.errors import NotDetermined, ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.mueller import reduce_mueller
 from processing.storage.captures.capture import Capture, CaptureError
 from processing.storage.products.images import MuellerImage
@@ -205,7 +205,7 @@ def test_bad_and_not_finite_pixels_are_flagged_and_nan(rgb950: InstrumentModel, 
     bad = np.zeros((4, 6), bool)
     bad[2, 5] = True
     with Capture(path) as capture:
-        correction = Correction.of(capture, bad=bad)
+        correction = CountCorrection.of(capture, bad=bad)
     image = reduced(path, rgb950, correction=correction)
     assert image.mask[0, 0] == Mask.NOT_FINITE
     assert image.mask[2, 5] == Mask.BAD

@@ -7,7 +7,7 @@ import pytest
 
 from processing.calibration.photon_transfer import bad_pixels, photon_transfer, read_camera, write_camera
 from processing.errors import NotDetermined, ProcessError
-from processing.reduction.counts_to_signal import Correction, saturation
+from processing.reduction.counts_to_signal import CountCorrection, saturation
 from processing.storage.captures.capture import Capture, CaptureError
 from processing.storage.products.product import Step
 
@@ -112,18 +112,18 @@ def test_dark_and_flat_of_another_capture(synthetic_capture) -> None:
     other = synthetic_capture(ones[..., :10] * 100, {}, role=("dark",), name="small.h5")
     real = synthetic_capture(ones * 100, {}, role=("dark",), name="real.h5", simulated=False)
     with Capture(sample) as s, Capture(dark) as d, Capture(flat) as f, Capture(other) as o, Capture(real) as r:
-        correction = Correction.of(s, dark_from=d, flat_from=[f])
+        correction = CountCorrection.of(s, dark_from=d, flat_from=[f])
         signal = (s.frames(0) - correction.black.at(0.01)) / correction.flat.response
         np.testing.assert_allclose(signal, 500, rtol=1e-5)
         assert "dark.h5" in correction.source
         with pytest.raises(CaptureError, match="same camera and size"):
-            Correction.of(s, dark_from=o)
+            CountCorrection.of(s, dark_from=o)
         with pytest.raises(CaptureError, match="never mixed"):
-            Correction.of(s, dark_from=r)
+            CountCorrection.of(s, dark_from=r)
         with pytest.raises(CaptureError, match="has no flat states"):
-            Correction.of(s, flat_from=[d])
+            CountCorrection.of(s, flat_from=[d])
         with pytest.raises(CaptureError, match="bad-pixel map"):
-            Correction.of(s, bad=np.zeros((3, 3), bool))
+            CountCorrection.of(s, bad=np.zeros((3, 3), bool))
         assert not bad_pixels(d).any()
 
 
@@ -144,4 +144,4 @@ def test_saturation_is_where_the_full_well_begins_to_spread(synthetic_capture, d
     path = synthetic_capture(pixels, {"psg": np.zeros(1)}, detector={"black_level_counts": 64.0, **detector})
     with Capture(path) as capture:
         assert saturation(capture) == level
-        assert Correction.of(capture).saturation == level
+        assert CountCorrection.of(capture).saturation == level

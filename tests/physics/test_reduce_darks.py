@@ -8,7 +8,7 @@ from processing.calibration.train import fit_trains
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.reduction.black import Black
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mosaic.merge import merge
 from processing.reduction.mueller import reduce_mueller
@@ -46,7 +46,7 @@ def test_what_is_told_of_the_darks(synthetic_capture, exposure_s, rate, told) ->
     exposure = np.array(exposure_s)
     frames = np.broadcast_to((64 + rate * exposure)[:, None, None, None], (6, 1, 4, 6)).astype(np.uint16)
     with Capture(synthetic_capture(frames, ANGLES, role=ROLE, exposure_s=exposure)) as capture:
-        correction = Correction.of(capture)
+        correction = CountCorrection.of(capture)
         if told is None:
             for k in range(2, 6):
                 np.testing.assert_allclose(correction.black.at(exposure[k]), capture.frames(k), atol=1)
@@ -136,7 +136,7 @@ def test_bracketed_mosaic_uses_the_long_exposure_where_it_can(synthetic_capture,
     path = bracketed(synthetic_capture, model, stand, [SHORT_S, LONG_S] * 4, {"psg": np.zeros(4)})
     noise = NoiseModel.of(DETECTOR, integer=True)
     with Capture(path) as capture:
-        merged = merge(capture, sample_states(capture), Correction.of(capture), noise)
+        merged = merge(capture, sample_states(capture), CountCorrection.of(capture), noise)
         reduce_stokes(capture, model.at(662), tmp_path / "s.h5", STEP, method="superpixel")
     layout = MosaicLayout.of(model.mosaic, [c.name for c in model.channels])
     truth = np.zeros(SHAPE)
@@ -178,9 +178,9 @@ def test_hot_pixel_of_a_flat_is_a_bad_pixel(synthetic_capture) -> None:
     flat[:, 0, 7, 9] = 4095
     role = {"role": ("flat", "flat"), "detector": {"bits": 12, "black_level_counts": 64.0}}
     with Capture(synthetic_capture(flat, {"psg": np.zeros(2)}, **role)) as capture:
-        correction = Correction.of(capture)
+        correction = CountCorrection.of(capture)
     assert np.argwhere(correction.bad).tolist() == [[7, 9]]
     flat[:, 0, :20] = 4095
     over = synthetic_capture(flat, {"psg": np.zeros(2)}, name="over.h5", **role)
     with Capture(over) as capture, pytest.raises(CaptureError, match="every flat state is saturated"):
-        Correction.of(capture)
+        CountCorrection.of(capture)

@@ -9,7 +9,7 @@ from processing.instrument.applied_effects import changes_at, changes_of, instru
 from processing.instrument.changes import Conditions, field_terms
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.polarization import mueller
-from processing.reduction.counts_to_signal import BlockReader, Correction
+from processing.reduction.counts_to_signal import BlockReader, CountCorrection
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.mueller import reduce_mueller
 from processing.storage.captures.capture import Capture
@@ -146,7 +146,7 @@ def test_pixels_of_a_mosaic_are_moved_among_their_own_kind(synthetic_capture) ->
     frames = np.stack([levels * (2000 + 500 * np.sin((x - a) / 7) * np.cos((y - b) / 9)) for a, b in shift])
     path = synthetic_capture(frames[:, None], {"psg": np.zeros(2), "psa": np.zeros(2)}, title="test")
     with Capture(path) as capture:
-        correction, states = Correction.of(capture), np.arange(2)
+        correction, states = CountCorrection.of(capture), np.arange(2)
 
         def off(pitch: int) -> float:
             counts = CountsCorrection(1.0, {}, shift, pitch)
@@ -174,7 +174,7 @@ def test_super_pixels_behind_a_plate_that_moves_the_image_are_moved_back(synthet
     )
     with Capture(path, by_super_pixel=True) as capture:
         counts = CountsCorrection(1.0, {}, shift, model.pitch)
-        reader = BlockReader(capture, np.arange(3), Correction.of(capture), counts)
+        reader = BlockReader(capture, np.arange(3), CountCorrection.of(capture), counts)
         moved = np.concatenate([reader.read(rows).copy() for rows in (slice(0, 15), slice(15, 32))], axis=2)
     images = moved.reshape(3, 4, 32, 40)
     for image in images[1:]:

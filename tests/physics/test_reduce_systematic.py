@@ -12,7 +12,7 @@ from processing.reduction.systematic import Systematic
 from processing.storage.captures.capture import Capture
 from processing.storage.products.product import Product, Step
 from processing.yaml_file import dump_yaml
-from simulators.blind.undeclared_captures import Bench
+from simulators.blind.undeclared_captures import TrueBench
 
 
 def uncertain(kind: str, element: str | None, **values: float) -> SystematicError:
@@ -24,7 +24,7 @@ def uncertain(kind: str, element: str | None, **values: float) -> SystematicErro
 @pytest.fixture
 def air(configs, tmp_path):
     """Air through a generator retarder of 1 degree more than declared."""
-    bench = Bench(rows=16, columns=16, dg=np.deg2rad(128.12))
+    bench = TrueBench(rows=16, columns=16, dg=np.deg2rad(128.12))
     return bench_capture(tmp_path, configs / "instruments/rgb950.yaml", bench, air=True, seed=2)
 
 

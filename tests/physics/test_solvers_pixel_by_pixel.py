@@ -11,7 +11,7 @@ import pytest
 
 from processing.errors import ProcessError
 from processing.reduction.black import Black
-from processing.reduction.counts_to_signal import BlockReader, Correction
+from processing.reduction.counts_to_signal import BlockReader, CountCorrection
 from processing.reduction.flat import FlatField
 from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers import plain, weighted
@@ -52,7 +52,7 @@ class Bench:
     inversion: Inversion
     reader: BlockReader
     frames: np.ndarray
-    correction: Correction
+    correction: CountCorrection
     sound: np.ndarray
 
     def signal(self):
@@ -124,7 +124,7 @@ def bench(request, flat, synthetic_capture, monkeypatch):
     )
     with Capture(path) as capture:
         black = Black.of(capture)
-        correction = Correction(black, "test", flat, bad, TOP)
+        correction = CountCorrection(black, "test", flat, bad, TOP)
         reader = BlockReader(capture, np.arange(DARKS, DARKS + STATES), correction, struck=struck)
         frames = reader.read(slice(0, ROWS)).copy()
         yield Bench(w, Inversion.of(w, basis=basis), reader, frames, correction, sound.reshape(-1, pixels))
@@ -201,7 +201,7 @@ def test_what_is_left_determines_a_pixel_or_does_not(share, determined, syntheti
     counts = np.full((17, 1, 1, 1), 1000.0)
     counts[15], counts[16] = 1000 * share, TOP
     with Capture(synthetic_capture(counts.astype(np.uint16), {}, detector={"bits": 12})) as capture:
-        reader = BlockReader(capture, np.arange(17), Correction(Black.level(0.0), "test", saturation=TOP))
+        reader = BlockReader(capture, np.arange(17), CountCorrection(Black.level(0.0), "test", saturation=TOP))
         found = MuellerSolver(Inversion.of(w), reader, NOISE).solve(reader.read(slice(0, 1)))
     assert (flags(found)[0] == Mask.SATURATED) == determined
     # As many states as unknowns: nothing is left over.

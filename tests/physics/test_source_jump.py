@@ -7,7 +7,7 @@ from bench_capture import bench_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
-from simulators.blind.undeclared_captures import Bench
+from simulators.blind.undeclared_captures import TrueBench
 
 STATES, RESUMED = 40, 22
 
@@ -15,7 +15,7 @@ STATES, RESUMED = 40, 22
 @pytest.mark.parametrize("air", [True, False])
 @pytest.mark.parametrize("fraction", [-0.04, 0.0])
 def test_a_jump_between_two_runs_is_found_and_none_where_there_is_none(configs, tmp_path, monkeypatch, air, fraction):
-    bench, file = Bench(rows=16, columns=16), configs / "instruments/rgb950.yaml"
+    bench, file = TrueBench(rows=16, columns=16), configs / "instruments/rgb950.yaml"
     bench.level.append(lambda k, a: 1 + fraction * (k >= RESUMED))
     path = bench_capture(tmp_path, file, bench, air, STATES, seed=11)
     with Capture(path) as capture:

@@ -11,15 +11,15 @@ from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
-from simulators.blind.real_bench import Disc
-from simulators.blind.undeclared_captures import Bench
+from simulators.blind.real_bench import RoundSample
+from simulators.blind.undeclared_captures import TrueBench
 
 STATES = 40
 
 
 def test_a_source_whose_size_is_told_too_small_is_as_even_as_one_that_is_told_right(configs, tmp_path):
     """Values that shrink to their prior leave a part of themselves in the whole image; that is no variation over it."""
-    bench = Bench(rows=40, columns=40)
+    bench = TrueBench(rows=40, columns=40)
     bench.level.append(lambda k, a: 1 + 0.05 * k / (STATES - 1))
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").nominal_at(662)
     with Capture(bench_capture(tmp_path, configs / "instruments/rgb950.yaml", bench, air=True)) as taken:
@@ -32,11 +32,11 @@ def test_a_source_whose_size_is_told_too_small_is_as_even_as_one_that_is_told_ri
 
 def test_where_the_image_moves_a_source_is_as_even(configs, tmp_path):
     """A twentieth of a pixel at the limb of a ball changes more than the source does; it is undone here too."""
-    bench = Bench(rows=64, columns=64)
+    bench = TrueBench(rows=64, columns=64)
     bench.level.append(lambda k, a: 1 + 0.03 * k / (STATES - 1))
     bench.shift.append(lambda k, a: (0.06 * k / (STATES - 1), 0.06 * k / (STATES - 1)))
     file = configs / "instruments/rgb950.yaml"
-    path = bench_capture(tmp_path, file, bench, seed=8, scene=Disc)
+    path = bench_capture(tmp_path, file, bench, seed=8, scene=RoundSample)
     model = InstrumentModel.load(file).nominal_at(662)
     with Capture(path) as taken:
         problem = InstrumentProblem(model, [without_steep_pixels(read_capture(taken, model))])

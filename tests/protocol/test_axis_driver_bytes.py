@@ -8,7 +8,7 @@ from drivers.apt_frames import apt_framer
 from drivers.axes import apt, elliptec, esp301, gcs2, smc100, zaber
 from drivers.errors import CommandRejected, NotHomedError, ReplyError
 from drivers.serial_link import LONGEST_FRAME, LineRegistry, line_framer
-from simulators.clock import Clock, patient_clock
+from simulators.clock import FastClock, patient_clock
 from simulators.controllers import esp301 as esp301_emulator
 from simulators.controllers import zaber as zaber_emulator
 from simulators.serial.pty_port import PtyPort
@@ -327,7 +327,7 @@ def test_a_zaber_reply_that_lost_its_checksum_is_not_believed() -> None:
 
 
 def test_zaber_homes_at_the_lesser_of_two_speeds() -> None:
-    emulator = zaber_emulator.make(ServeOptions(homed=True, clock=Clock(100.0, base=patient_clock())))
+    emulator = zaber_emulator.make(ServeOptions(homed=True, clock=FastClock(100.0, base=patient_clock())))
     for device in emulator.devices:
         device.approach_deg_s = 10 * device.axis.speed_deg_s
     with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
@@ -338,7 +338,7 @@ def test_zaber_homes_at_the_lesser_of_two_speeds() -> None:
 
 
 def test_errors_of_one_esp301_axis_are_kept_while_another_is_asked() -> None:
-    emulator = esp301_emulator.make(ServeOptions(clock=Clock(100.0, base=patient_clock())))
+    emulator = esp301_emulator.make(ServeOptions(clock=FastClock(100.0, base=patient_clock())))
     with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         first, second = (esp301.open(f"axis {k}", esp301.Config(port=port.path, axis=k), lines) for k in (1, 2))
         emulator.errors.extend([(204, 0), (7, 0), (120, 0)])

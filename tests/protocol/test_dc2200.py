@@ -14,20 +14,20 @@ from drivers.errors import CommandRejected, DeviceError, PortLost, PortNotFound
 from drivers.message_device import MessageDevice
 from drivers.serial_link import LineRegistry
 from drivers.sources import dc2200
-from simulators.clock import Clock, patient_clock
+from simulators.clock import FastClock, patient_clock
 from simulators.controllers.dc2200 import DC2200Emulator
 from simulators.serial.pty_port import PtyPort
 
 
 @pytest.fixture
 def box() -> Iterator[tuple[DC2200Emulator, str, LineRegistry]]:
-    emulator = DC2200Emulator(Clock(base=patient_clock()))
+    emulator = DC2200Emulator(FastClock(base=patient_clock()))
     with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         yield emulator, port.path, lines
 
 
 def test_scpi_of_the_box() -> None:
-    emulator = DC2200Emulator(Clock())
+    emulator = DC2200Emulator(FastClock())
     for sent, came in (
         (b"*IDN?\n", b"THORLABS,DC2200,M00960538,1.5.0\n"),
         (b"SOURCE1:MODE CB\nSYSTem:ERRor?\n", b'0,"No error"\n'),

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 from drivers.errors import DeviceError, WrongDevice
 from drivers.serial_link import LineRegistry
 from drivers.sources import dc2200, dc4100, fw102c, sc10
-from simulators.clock import Clock, patient_clock
+from simulators.clock import FastClock, patient_clock
 from simulators.controllers.fw102c import FW102CEmulator
 from simulators.controllers.sc10 import SC10Emulator
 from simulators.serial.emulator import Emulator
@@ -21,13 +21,13 @@ POSITIONS = {451.0: 1, 662.0: 3}
 
 @pytest.fixture
 def wheel() -> Iterator[tuple[FW102CEmulator, str, LineRegistry]]:
-    emulator = FW102CEmulator(Clock(100.0, base=patient_clock()))
+    emulator = FW102CEmulator(FastClock(100.0, base=patient_clock()))
     with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         yield emulator, port.path, lines
 
 
 def test_bytes_of_the_wheel() -> None:
-    emulator = FW102CEmulator(Clock(instant=True), step_s=0.0)
+    emulator = FW102CEmulator(FastClock(instant=True), step_s=0.0)
     for sent, came in (
         (b"*idn?\r", b"*idn?\rTHORLABS FW102C/FW212C Filter Wheel version 1.07\r> "),
         (b"pos?\r", b"pos?\r6\r> "),
@@ -53,7 +53,7 @@ class OtherLineEnds:
 
 @pytest.mark.parametrize("line_end", [b"\n", b"\r\n", b"\n\r"])
 def test_lines_that_end_otherwise(line_end: bytes) -> None:
-    emulator = FW102CEmulator(Clock(100.0, base=patient_clock()))
+    emulator = FW102CEmulator(FastClock(100.0, base=patient_clock()))
     with (
         PtyPort(OtherLineEnds(emulator, line_end)) as port,
         LineRegistry(clock=patient_clock()) as lines,
@@ -84,7 +84,7 @@ def test_the_filter_of_the_wavelength_stands_in_the_beam(wheel: tuple[FW102CEmul
 
 def test_a_shutter_beside_the_wheel_makes_dark(wheel: tuple[FW102CEmulator, str, LineRegistry]) -> None:
     emulator, path, lines = wheel
-    box = SC10Emulator(Clock(base=patient_clock()))
+    box = SC10Emulator(FastClock(base=patient_clock()))
     with PtyPort(box) as port:
         shutter = sc10.Config(port=port.path)
         source = fw102c.open(fw102c.Config(port=path, positions=POSITIONS, shutter=shutter), lines)

@@ -7,14 +7,14 @@ import pytest
 from drivers.errors import CommandRejected
 from drivers.serial_link import LineRegistry
 from drivers.sources import i7000
-from simulators.clock import Clock, patient_clock
+from simulators.clock import FastClock, patient_clock
 from simulators.controllers.i7000 import I7060Emulator
 from simulators.serial.pty_port import PtyPort
 
 
 @pytest.fixture
 def module():
-    emulator = I7060Emulator(Clock(base=patient_clock()))
+    emulator = I7060Emulator(FastClock(base=patient_clock()))
     with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         yield emulator, i7000.open(i7000.Config(port=port.path, watchdog_s=0.5), lines)
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simulators.clock import LONGEST_BEAT_S, Clock, ManualClock, PatientClock, TrapezoidMotion, patient_clock
+from simulators.clock import LONGEST_BEAT_S, FastClock, ManualClock, PatientClock, TrapezoidMotion, patient_clock
 from simulators.serial.emulator import EmulatedAxis
 from simulators.serial.reply_faults import Fault, FaultSchedule, parse_fault
 
@@ -89,16 +89,16 @@ def test_without_a_reference_the_reported_angle_is_only_relative() -> None:
 
 def test_clocks_run_fast_or_jump() -> None:
     base = ManualClock()
-    fast = Clock(1000.0, base=base)
+    fast = FastClock(1000.0, base=base)
     fast.sleep_s(10.0)
     assert base.now_s() == pytest.approx(0.01)
     assert fast.now_s() == pytest.approx(10.0)
-    instant = EmulatedAxis(Clock(instant=True), homed=True)
+    instant = EmulatedAxis(FastClock(instant=True), homed=True)
     instant.move_to(1e5)
     assert not instant.is_moving()
     assert instant.position_deg() == 1e5
     with pytest.raises(ValueError, match="positive"):
-        Clock(0.0)
+        FastClock(0.0)
 
 
 def test_a_patient_clock_leaves_out_the_time_in_which_not_all_were_there() -> None:

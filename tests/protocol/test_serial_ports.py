@@ -20,7 +20,7 @@ from drivers.axes import smc100, zaber
 from drivers.errors import PermissionRefused, PortBusy, PortNotFound
 from drivers.registry import device_kinds, open_axis
 from drivers.serial_link import LineRegistry, SerialLink, line_framer
-from simulators.clock import Clock, patient_clock
+from simulators.clock import FastClock, patient_clock
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
@@ -28,7 +28,7 @@ from simulators.serial.serve_options import ServeOptions
 
 
 def zaber_emulator(**options: object):  # type: ignore[no-untyped-def]
-    return served_kinds()["zaber"](ServeOptions(homed=True, clock=Clock(100.0, base=patient_clock()), **options))  # type: ignore[arg-type]
+    return served_kinds()["zaber"](ServeOptions(homed=True, clock=FastClock(100.0, base=patient_clock()), **options))  # type: ignore[arg-type]
 
 
 def test_no_permission_names_the_group(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def behind_tcp(emulator: Emulator, line_end: bytes = b"\r\n") -> Iterator[str]:
 @pytest.mark.parametrize("line_end", [b"\r\n", b"\r", b"\n"])
 @pytest.mark.parametrize("kind", ["zaber", "esp301", "smc100"])
 def test_an_axis_behind_tcp(kind: str, line_end: bytes) -> None:
-    emulator = served_kinds()[kind](ServeOptions(homed=True, clock=Clock(100.0, base=patient_clock())))
+    emulator = served_kinds()[kind](ServeOptions(homed=True, clock=FastClock(100.0, base=patient_clock())))
     with behind_tcp(emulator, line_end) as port, LineRegistry(clock=patient_clock()) as lines:
         axis = open_axis("psg", axis_configs(emulator, port, homed=True)[0], lines)
         assert axis.start_move(45.0).wait().deg == pytest.approx(45.0, abs=0.01)

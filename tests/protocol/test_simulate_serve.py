@@ -9,7 +9,7 @@ import pytest
 
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
-from simulators.clock import Clock, patient_clock
+from simulators.clock import FastClock, patient_clock
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.serve_options import ServeOptions
 
@@ -76,7 +76,7 @@ def test_wrong_options_are_explained(arguments: list[str], message: str) -> None
 
 
 def test_defaults_are_those_that_the_documentation_names() -> None:
-    options = ServeOptions(clock=Clock(base=patient_clock()))
+    options = ServeOptions(clock=FastClock(base=patient_clock()))
     zaber = served_kinds()["zaber"](options)
     assert [(axis.min_deg, axis.max_deg) for axis in zaber.axes] == [(None, None), (None, None), (0.0, 190.0)]
     assert not any(axis.homed for axis in zaber.axes)

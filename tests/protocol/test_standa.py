@@ -10,7 +10,7 @@ from drivers.axes import standa
 from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
 from drivers.serial_link import LineRegistry
 from drivers.standa_frames import LAYOUTS, framer, message
-from simulators.clock import Clock, ManualClock, patient_clock
+from simulators.clock import FastClock, ManualClock, patient_clock
 from simulators.controllers import standa as emulated
 from simulators.controllers.standa import StandaEmulator
 from simulators.serial.pty_port import PtyPort
@@ -24,7 +24,7 @@ BORDERS = bytes.fromhex("73656473 06 01 9cffffff fdff c8000000 0700 cccccccccccc
 
 @contextmanager
 def opened(homed: bool = True, **options: Any) -> Iterator[tuple[StandaEmulator, standa.StandaAxis]]:
-    clock = Clock(200.0, base=patient_clock())
+    clock = FastClock(200.0, base=patient_clock())
     emulator = emulated.make(ServeOptions(**{"homed": homed, "clock": clock} | options))
     with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         entry = {"port": port.path, "steps_per_deg": 100, "poll_s": 0.002, "reply_s": 0.25, "assume_homed": homed}
@@ -62,7 +62,7 @@ def test_answers_are_found_in_noise() -> None:
 
 
 def test_opening_reads_units_and_borders() -> None:
-    emulator = emulated.make(ServeOptions(clock=Clock(200.0, base=patient_clock())))
+    emulator = emulated.make(ServeOptions(clock=FastClock(200.0, base=patient_clock())))
     emulator.settings |= {b"eds": (5, 6, -2100, 0, 32100, 128), b"mov": (2000, 128, 3000, 5000, 2000, 0)}
     with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         axis = standa.open("psg", standa.Config(port=port.path, steps_per_deg=100), lines)
@@ -91,7 +91,7 @@ def test_home_gives_the_count_a_zero_and_needs_both_the_flag_and_this_session() 
 
 def test_a_homing_that_was_stopped_makes_no_reference() -> None:
     # So slow that it does not get home before the stop, however late that comes.
-    with opened(homed=False, speed_deg_s=1.0, clock=Clock(1.0, base=patient_clock())) as (_, axis):
+    with opened(homed=False, speed_deg_s=1.0, clock=FastClock(1.0, base=patient_clock())) as (_, axis):
         axis.home()
         axis.stop()
         while axis.is_moving():

@@ -5,7 +5,7 @@ import pytest
 from drivers.axes import xps
 from drivers.errors import LimitError, MotionStopped
 from drivers.serial_link import LineRegistry
-from simulators.clock import Clock, ManualClock, patient_clock
+from simulators.clock import FastClock, ManualClock, patient_clock
 from simulators.controllers import xps as xps_emulator
 from simulators.serial.emulator import Emulator
 from simulators.serial.serve_options import ServeOptions
@@ -13,7 +13,7 @@ from simulators.serial.tcp_port import port_for
 
 
 def test_xps_bytes() -> None:
-    emulator = xps_emulator.make(ServeOptions(clock=Clock(instant=True)))
+    emulator = xps_emulator.make(ServeOptions(clock=FastClock(instant=True)))
     talk, motion = emulator.connect(), emulator.connect()
     for line, sent, came in (
         (talk, b"FirmwareVersionGet(char *)", b"0,XPS-C8 Firmware V2.6.x,EndOfAPI"),
@@ -82,7 +82,7 @@ def test_jog_and_gathering() -> None:
 
 
 def test_an_xps_puts_out_a_pulse_at_every_step_that_it_passes() -> None:
-    emulator = xps_emulator.make(ServeOptions(clock=Clock(100.0, base=patient_clock()), homed=True))
+    emulator = xps_emulator.make(ServeOptions(clock=FastClock(100.0, base=patient_clock()), homed=True))
     with port_for(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         config = xps.Config(port=port.path, group="Group1", direction=-1, zero_deg=5.0, poll_s=0.002)
         axis = xps.open("arm", config, lines)
@@ -100,7 +100,7 @@ def test_an_xps_puts_out_a_pulse_at_every_step_that_it_passes() -> None:
         for ends in ((10.0, 9.0), (10.0, 10.25), (10.0, 400.0)):
             with pytest.raises(LimitError):
                 axis.output_pulses(*ends, 0.1)
-    talk = xps_emulator.make(ServeOptions(clock=Clock(instant=True))).connect()
+    talk = xps_emulator.make(ServeOptions(clock=FastClock(instant=True))).connect()
     talk.receive(b"PositionerPositionCompareSet(Group1.Pos,0,10,0.5)")
     assert talk.take_output() == b"-22,PositionerPositionCompareSet(Group1.Pos,0,10,0.5),EndOfAPI"
 
@@ -127,7 +127,9 @@ class HoldsAnAbortedMotionBack:
 
 
 def test_the_answer_of_an_aborted_motion_is_not_taken_for_that_of_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
-    emulator = xps_emulator.make(ServeOptions(clock=Clock(20.0, base=patient_clock()), homed=True, speed_deg_s=10.0))
+    emulator = xps_emulator.make(
+        ServeOptions(clock=FastClock(20.0, base=patient_clock()), homed=True, speed_deg_s=10.0)
+    )
     connect = emulator.connect
     monkeypatch.setattr(emulator, "connect", lambda: HoldsAnAbortedMotionBack(connect()))
     with port_for(emulator) as port, LineRegistry(clock=patient_clock()) as lines:

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from simulators.clock import Clock
+from simulators.clock import FastClock
 from simulators.rig.controller_kinds import served_kinds
 from simulators.serial.emulator import Emulator
 from simulators.serial.serve_options import ServeOptions
@@ -15,7 +15,7 @@ from simulators.serial.tcp_port import port_for
 
 @contextmanager
 def served(kind: str, speed: float = 20.0) -> Iterator[tuple[Emulator, str]]:
-    emulator = served_kinds()[kind](ServeOptions(clock=Clock(speed)))
+    emulator = served_kinds()[kind](ServeOptions(clock=FastClock(speed)))
     with port_for(emulator) as port:
         yield emulator, port.path
 

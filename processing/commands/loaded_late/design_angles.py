@@ -10,7 +10,7 @@ from processing.arrays import Array
 from processing.calibration.free_angles import FreeDesign, Goal, bound_of, free_design, with_retardances
 from processing.calibration.motor_time import Point, Speed, front, move_seconds
 from processing.calibration.robustness import ERRORS, errors_of_table
-from processing.calibration.state_design import Noise, score
+from processing.calibration.state_design import AssumedNoise, score
 from processing.commands.progress_bar import progress_bar
 from processing.errors import ProcessError
 from processing.instrument.determined import determined_basis
@@ -24,7 +24,7 @@ SINGULAR = 1e9
 
 def optimize_angles(
     model: InstrumentModel,
-    noise: Noise,
+    noise: AssumedNoise,
     now: Mapping[int, StateTable | None],
     free: str,
     speeds: Sequence[str],
@@ -81,7 +81,7 @@ def _show(model: InstrumentModel, states: int, best: FreeDesign) -> None:
     )
 
 
-def _show_present(model: InstrumentModel, noise: Noise, now: StateTable, with_plates: bool) -> None:
+def _show_present(model: InstrumentModel, noise: AssumedNoise, now: StateTable, with_plates: bool) -> None:
     basis, intensities = determined_basis(model), len(now) * len(model.channels)
     found = score(model.rows(now.angles_deg), noise, basis, bound_of(model, intensities))
     is_whole = found.rank == found.wanted

@@ -30,7 +30,7 @@ from processing.diagnosis.search.rules import (
 from processing.instrument.changes import Conditions, elapsed, elapsed_error
 from processing.instrument.model import InstrumentModel
 from processing.reduction.black import Black
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.frame_evidence import evidence_of
 from processing.reduction.measurement_matrix import angles_of, measurement_matrix, relative_exposure
 from processing.reduction.noise import NoiseModel
@@ -60,7 +60,9 @@ class Frames:
     side: int
 
 
-def read_frames(capture: Capture, model: InstrumentModel, states: NDArray[np.int64], correction: Correction) -> Frames:
+def read_frames(
+    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], correction: CountCorrection
+) -> Frames:
     """Read some states of a capture one after the other, as `model` sees them."""
     split = _Split(model)
     exposure = capture.column("exposure_s")[states].astype(float)
@@ -135,7 +137,7 @@ def _cuts_off(capture: Capture) -> bool:
     return detector.black_level_counts > NOISE_SURE * (detector.read_noise_e or 0.0) / detector.gain_e_per_count
 
 
-def _clip_level(capture: Capture, correction: Correction) -> float | None:
+def _clip_level(capture: Capture, correction: CountCorrection) -> float | None:
     detector, level = capture.header.detector, correction.saturation
     if detector.full_well_e is not None and detector.gain_e_per_count is not None:
         well = detector.black_level_counts + detector.full_well_e / detector.gain_e_per_count
@@ -159,7 +161,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     """
     states = sample_states(capture)
     angles_of(capture, model, states)
-    correction = Correction.of(capture)
+    correction = CountCorrection.of(capture)
     frames = read_frames(capture, capture.seen(model), states, correction)
     raw, side = frames.counts, frames.side
     cut_off = frames.zero_share > MOST_CUT_OFF

@@ -26,7 +26,7 @@ from processing.geometry.pinhole import PinholeCamera
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.changes import Conditions
 from processing.instrument.model import InstrumentModel
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
 from processing.reflectance.base import ReflectanceModel
@@ -169,7 +169,7 @@ def _tiles(where: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int6
 
 def _black_variance(capture: Capture) -> float:
     """Variance, counts^2, of what is subtracted from the mean of all sample states."""
-    black = Correction.of(capture).black
+    black = CountCorrection.of(capture).black
     noise = NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
     share = black.weights(capture.column("exposure_s")[sample_states(capture)].astype(float)).mean(axis=0)
     return float(share**2 @ black.mean_variance(noise))

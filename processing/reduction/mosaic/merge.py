@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Image
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.measurement_matrix import relative_exposure
 from processing.reduction.noise import NoiseModel
@@ -40,7 +40,7 @@ class MergedFrame:
 def merge(
     capture: Capture,
     states: NDArray[np.int64],
-    correction: Correction,
+    correction: CountCorrection,
     noise: NoiseModel | None,
     *,
     counts: CountsCorrection | None = None,

@@ -15,7 +15,7 @@ from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect
 
 
-class AnalyzerRoll(ReflectanceEffect):
+class SurfaceAnalyzerRoll(ReflectanceEffect):
     """Degrees by which every element of the analyzer is turned.
 
     A known surface shows it; with an unknown sample it is a part of the Mueller matrix.

@@ -14,7 +14,7 @@ from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect
 
 
-class IlluminationAzimuth(ReflectanceEffect):
+class SurfaceIlluminationAzimuth(ReflectanceEffect):
     """Degrees by which the generator azimuth is off."""
 
     def parameters(self, place: str) -> tuple[Parameter, ...]:

@@ -6,18 +6,18 @@ from typing import Annotated
 
 from pydantic import Field
 
-from simulators.bench.effects.detector import BlackDrift, BlackOffset, Nonlinearity, PixelResponse, ToneCurve
-from simulators.bench.effects.image import ImageDrift, MosaicCrosstalk, StrayLight, VeilingGlare
+from simulators.bench.effects.detector import BlackDrift, BlackOffset, Nonlinearity, PixelResponse, ToneCurveFault
+from simulators.bench.effects.image import ImageDriftFault, MosaicCrosstalk, StrayLightFault, VeilingGlare
 from simulators.bench.effects.motion import AngleJitter, AngleOffset, AnglePlay, AngleScale, AngleSlip, AngleWobble
 from simulators.bench.effects.optics import (
     ChannelError,
     ElementError,
-    FieldRetardance,
+    FieldRetardanceFault,
     PlateRetardance,
     PlateTransmission,
-    Window,
+    WindowPlate,
 )
-from simulators.bench.effects.source import SourceDrift, SourceFlicker, SourceLevel, SourceStep, UnevenLight
+from simulators.bench.effects.source import DriftFault, FlickerFault, LevelFault, SourceStep, UnevenLight
 
 #: Any of them, told apart by `kind`; docs/effects.md has one for each effect of `diagnose`.
 AnyBenchEffect = Annotated[
@@ -28,24 +28,24 @@ AnyBenchEffect = Annotated[
     | AngleSlip
     | AnglePlay
     | ElementError
-    | Window
+    | WindowPlate
     | PlateRetardance
     | PlateTransmission
-    | FieldRetardance
+    | FieldRetardanceFault
     | ChannelError
-    | SourceDrift
-    | SourceFlicker
+    | DriftFault
+    | FlickerFault
     | SourceStep
-    | SourceLevel
+    | LevelFault
     | UnevenLight
-    | ImageDrift
-    | StrayLight
+    | ImageDriftFault
+    | StrayLightFault
     | VeilingGlare
     | MosaicCrosstalk
     | Nonlinearity
     | PixelResponse
     | BlackDrift
     | BlackOffset
-    | ToneCurve,
+    | ToneCurveFault,
     Field(discriminator="kind"),
 ]

@@ -54,7 +54,7 @@ class BlackOffset(BenchEffect):
         return np.asarray(electrons + np.float32(self.electrons))
 
 
-class ToneCurve(BenchEffect):
+class ToneCurveFault(BenchEffect):
     """The camera stores a power of the light: its contrast setting is not 1."""
 
     kind: Literal["tone_curve"] = "tone_curve"

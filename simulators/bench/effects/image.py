@@ -11,7 +11,7 @@ from processing.arrays import Image
 from simulators.bench.effects.base import BenchEffect, Shot
 
 
-class ImageDrift(BenchEffect):
+class ImageDriftFault(BenchEffect):
     """The image moves: steadily with time, and in a circle with an axis whose element is a wedge (pixels)."""
 
     kind: Literal["image_drift"] = "image_drift"
@@ -35,7 +35,7 @@ class ImageDrift(BenchEffect):
         return np.asarray(shift(electrons, (rows, columns), order=1, mode="nearest"), dtype=np.float32)
 
 
-class StrayLight(BenchEffect):
+class StrayLightFault(BenchEffect):
     """Light that never saw the polarization optics: electrons a second on every pixel, falling over the columns."""
 
     kind: Literal["stray_light"] = "stray_light"

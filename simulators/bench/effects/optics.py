@@ -34,7 +34,7 @@ class ElementError(BenchEffect):
         return with_element(model, self.element, **{self.parameter: value})
 
 
-class Window(BenchEffect):
+class WindowPlate(BenchEffect):
     """A plate under stress behind an element of the generator: linear retardance that nobody declared.
 
     Behind the polarizer at 45 degrees it makes the light elliptic, by half of its retardance.
@@ -87,7 +87,7 @@ class PlateRetardance(BenchEffect):
         return with_element(model, self.element, retardance_deg=declared + self.amplitude_deg * float(np.cos(turned)))
 
 
-class FieldRetardance(BenchEffect):
+class FieldRetardanceFault(BenchEffect):
     """Rays meet a plate at an angle: its retardance grows with the square of the distance from a centre.
 
     `edge_deg` is what is added at half the image width from the centre (`x`, `y`; -1 to 1 over the image).

@@ -11,7 +11,7 @@ from processing.arrays import Image
 from simulators.bench.effects.base import BenchEffect, Shot
 
 
-class SourceDrift(BenchEffect):
+class DriftFault(BenchEffect):
     """The lamp's level changes by a fraction an hour."""
 
     kind: Literal["source_drift"] = "source_drift"
@@ -21,7 +21,7 @@ class SourceDrift(BenchEffect):
         return level * (1 + self.fraction_per_hour * shot.time_s / 3600)
 
 
-class SourceFlicker(BenchEffect):
+class FlickerFault(BenchEffect):
     """The lamp's level is random from exposure to exposure, relative standard deviation `sigma`."""
 
     kind: Literal["source_flicker"] = "source_flicker"
@@ -42,7 +42,7 @@ class SourceStep(BenchEffect):
         return level * (1 + self.fraction) if shot.index >= self.at_index else level
 
 
-class SourceLevel(BenchEffect):
+class LevelFault(BenchEffect):
     """The source gives `factor` times its light: enough of it saturates the detector."""
 
     kind: Literal["source_level"] = "source_level"

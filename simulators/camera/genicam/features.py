@@ -27,7 +27,7 @@ _STATUS = ("AcquisitionStatusSelector", "AcquisitionStatus")
 _IMAGE_CHUNK_BYTES = 8
 
 
-class Features:
+class FeatureValues:
     """What the camera is set to and what it tells.
 
     Parameters
