@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from processing.instrument.model import InstrumentModel as InstrumentModel
     from processing.instrument.states import StateTable as StateTable
     from processing.instrument.states import rotating_retarders as rotating_retarders
+    from processing.labelled import follow_region as follow_region
     from processing.labelled import open_campaign as open_campaign
     from processing.labelled import open_dataset as open_dataset
     from processing.labelled import reduce_to_dataset as reduce_to_dataset
@@ -48,6 +49,7 @@ _PUBLIC = {
     "Product": "processing.storage.products.product",
     "MuellerImage": "processing.storage.products.images",
     "StokesImage": "processing.storage.products.images",
+    "follow_region": "processing.labelled",
     "open_campaign": "processing.labelled",
     "open_dataset": "processing.labelled",
     "reduce_to_dataset": "processing.labelled",

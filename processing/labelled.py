@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,8 @@ import numpy as np
 
 from processing.doors import require_new
 from processing.errors import ProcessError
+from processing.maps.means import mean_of
+from processing.maps.region import parse_region
 from processing.steps.reduction import Reduction
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import CaptureHeader, create_layout, write_closing
@@ -113,6 +116,78 @@ def open_campaign(folder: Path | str, kind: str = "mueller") -> xr.Dataset:
     }
     attributes = {"kind": kind, "simulated": one.attrs["simulated"]}
     return xr.Dataset(variables, coords | dict(one.coords), attributes)
+
+
+def follow_region(folder: Path | str, region: str | None = None, kind: str = "mueller") -> xr.Dataset:
+    """Means of one region in every Mueller or Stokes image of a folder, as `process mean` gives them.
+
+    Parameters
+    ----------
+    folder
+        Folder with products, and its subfolders.
+    region
+        Pixels as "r0:r1,c0:c1"; default: the middle half of the image.
+    kind
+        "mueller" or "stokes".
+
+    Returns
+    -------
+    Dataset
+        `value`, `u_noise` and `u_systematic` over (file, quantity), with the coordinates `sample`, `wavelength` in nm,
+        `omega` in degrees and `time` of the capture. `u_systematic` is what the instrument leaves uncertain.
+
+    Raises
+    ------
+    ProcessError
+        There is no product of that kind, or no pixel of a region can be used.
+
+    Examples
+    --------
+    >>> for name in ("sphere.h5", "sphere_60.h5"):
+    ...     _ = Reduction(name).make()
+    >>> found = follow_region(".", "4:12,8:16").sel(quantity="m11_over_m00")
+    >>> found.omega.values.tolist(), found.value.dims
+    ([35.0, 60.0], ('file',))
+    """
+    import xarray as xr
+
+    lines: list[tuple[Any, ...]] = []
+    names: list[str] = []
+    for path in (path for path in sorted(Path(folder).rglob("*.h5")) if is_product(path)):
+        with Product(path) as product:
+            if product.kind != kind:
+                continue
+            header, time = product.header, taken_at(product)
+            place = parse_region(region, product.shape)
+        means = mean_of([path], place)
+        names = names or [one.name for one in means]
+        if [one.name for one in means] != names:
+            raise ProcessError(f"{path}: its instrument determines other quantities than that of {lines[0][0]}")
+        sample = header.sample.name or header.sample.kind
+        omega = np.nan if header.omega_deg is None else header.omega_deg
+        moment = datetime.fromisoformat(time).astimezone(UTC).replace(tzinfo=None) if time else "NaT"
+        stamp = np.datetime64(moment, "ns")
+        lines.append((str(path), sample, header.wavelength_nm, omega, stamp, means))
+    if not lines:
+        raise ProcessError(f"{folder}: no product of kind {kind!r}. Make them with: ./lab process reduce {folder}")
+    file, *columns, found = zip(*lines, strict=True)
+    labels = ("sample", "wavelength", "omega", "time")
+    coords = {label: ("file", list(column)) for label, column in zip(labels, columns, strict=True)}
+    data = {
+        name: (("file", "quantity"), [[getattr(one, name) for one in means] for means in found])
+        for name in ("value", "u_noise", "u_systematic")
+    }
+    return xr.Dataset(data, {"file": list(file), "quantity": names, **coords})
+
+
+def taken_at(product: Product) -> str:
+    """When the capture of a product was begun (ISO 8601); empty where the capture is no longer where it was."""
+    for identity in product.steps[0].inputs if product.steps else ():
+        path = Path(str(identity.get("path", "")))
+        if identity.get("role") == "capture":
+            with suppress(ProcessError), Capture(path) as capture:
+                return capture.start_time
+    return ""
 
 
 def _on_demand(grid: Any, name: str, dtype: Any, plane: tuple[int, ...]) -> Any:

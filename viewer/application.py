@@ -12,7 +12,20 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from processing.errors import ProcessError
-from viewer import alarms, browsing, comparing, following, frames, notes, probes, products, regions, starting, verdicts
+from viewer import (
+    alarms,
+    browsing,
+    comparing,
+    following,
+    frames,
+    notes,
+    probes,
+    products,
+    regions,
+    stacks,
+    starting,
+    verdicts,
+)
 from viewer.guard import PageGuard
 from viewer.library import Library, NotHere
 from viewer.pages import Pages, pages_of, whole_style
@@ -47,6 +60,9 @@ def application(folder: Path, token: str) -> Starlette:
         Route("/regions.csv", regions.table),
         Route("/keep-region", regions.keep_region, methods=["POST"]),
         Route("/drop-region", regions.drop_region, methods=["POST"]),
+        Route("/stack", stacks.stack),
+        Route("/stacked", stacks.stacked),
+        Route("/stack.csv", stacks.table),
         Route("/note", notes.write_note, methods=["POST"]),
         Route("/compare", comparing.compare),
         Route("/difference", comparing.difference),

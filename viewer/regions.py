@@ -82,7 +82,7 @@ async def keep_region(request: Request) -> JSONResponse:
 
 
 def _keep_region(library: Library, asked: dict[str, str]) -> JSONResponse:
-    shape = _Image(library.path(asked.get("file", ""))).shape
+    shape = MeasuredImage(library.path(asked.get("file", ""))).shape
     place, name = Region.asked(asked, shape), asked.get("name", "").strip()
     if not NAME.fullmatch(name):
         raise ProcessError("a region has a name of up to 40 letters, digits, spaces and signs . ( ) + - _")
@@ -112,7 +112,7 @@ def _drop_region(library: Library, name: str) -> JSONResponse:
 def regions(request: Request) -> JSONResponse:
     """One quantity of an image in the region that the request names by x0 and y0, and in every named one."""
     path, query = file_of(request), request.query_params
-    image = _Image(path)
+    image = MeasuredImage(path)
     named = [("", Region.asked(query, image.shape))] if "x0" in query else []
     named += _named(pages_of(request).library, image.shape)
     return JSONResponse({"regions": [image.row(name, region, query) for name, region in named]})
@@ -121,7 +121,7 @@ def regions(request: Request) -> JSONResponse:
 def table(request: Request) -> Response:
     """Every quantity of an image in every named region, as comma-separated text."""
     path = file_of(request)
-    image = _Image(path)
+    image = MeasuredImage(path)
     text = io.StringIO()
     text.write(f"# {path.name}\n" + ("# SIMULATED data\n" if image.simulated else ""))
     lines = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
@@ -162,7 +162,7 @@ class _Pixels:
     mean: tuple[float, float, float] | None = None
 
 
-class _Image:
+class MeasuredImage:
     """A capture or a product, of whose regions pages ask."""
 
     def __init__(self, path: Path) -> None:

@@ -2,22 +2,29 @@
 
 import json
 
+import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
 from acquisition.campaign.identity import IDENTITY
+from acquisition.rig import alarms
+from processing.commands.diagnose import main as diagnose
 from processing.steps.maps import Quantities
 from processing.steps.reduction import Reduction
+from viewer.diagnoses import Diagnoses
 from viewer.jobs import Jobs
+from viewer.library import Library
 
 #: What is checked: everything that axe knows of the levels A and AA, and its best practice.
 RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]}
 
 
 @pytest.fixture
-def pages(lab, drr_capture, client):
-    """Address of each page of a folder with captures, products, a campaign, regions, notes and a job."""
+def pages(lab, drr_capture, client, diagnosed, monkeypatch, tmp_path):
+    """Address of each page of a folder with captures, products, a campaign, regions, notes, a job and an alarm."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    alarms.give_alarm("bench", "acquire died. THE LIGHT IS NOT SHUT: no answer")
     one, two = drr_capture("one.h5", omega_deg=35.0), drr_capture("two.h5", seed_of_noise=2)
     products = [Reduction(one).make(), Reduction(two).make()]
     Quantities(products[0]).make()
@@ -39,8 +46,25 @@ def pages(lab, drr_capture, client):
         "quantities": "/product?file=one.quantities.h5#x=5&y=4",
         "compare": "/compare?a=one.mueller.h5&b=two.mueller.h5",
         "campaign": "/campaign?folder=night",
+        "stack": "/stack",
+        "diagnosis": f"/diagnosis?name={diagnosed}",
+        "report": f"/diagnosis-report?name={diagnosed}",
+        "refused": "/capture?file=none.h5",
         "job": f"/job?name={job.name}",
     }
+
+
+@pytest.fixture
+def diagnosed(lab, drr_capture, configs, run_main):
+    """A diagnosis against a file whose plate has another retardance, as the button leaves it; returns its name."""
+    capture = drr_capture("air.h5", sample={"kind": "air"}, mueller=np.eye(4))
+    text = (configs / "instruments/rgb950.yaml").read_text()
+    (lab / "off.yaml").write_text(text.replace("662: 127.12", "662: 128.9"))
+    name, folder = Diagnoses(Library(lab)).begin([capture], lab / "off.yaml")
+    outputs = ("--json", folder / "diagnosis.json", "--report", folder / "report.html")
+    given = ("--instrument", folder / "instrument.yaml", "--residuals", folder / "residuals.npz")
+    assert run_main(diagnose, capture, *given, *outputs)[0] == 0
+    return name
 
 
 def findings(page):
