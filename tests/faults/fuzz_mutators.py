@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import os
 import random
@@ -166,7 +167,8 @@ def spoil_yaml(rng: random.Random, text: str) -> str:
         elif how == 2 and isinstance(node[key], list) and len(node[key]) > 1:
             node[key] = node[key][::-1]
         else:
-            node[key] = rng.choice(ODD)
+            # A copy: a value that is put into itself has no end.
+            node[key] = copy.deepcopy(rng.choice(ODD))
     out = io.StringIO()
     YAML(typ="safe", pure=True).dump(tree, out)
     return out.getvalue()
