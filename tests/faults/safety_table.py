@@ -19,6 +19,7 @@ import fcntl
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -206,10 +207,11 @@ def once(number: int, faults: list[str], gap_s: float, discs: Discs, *, cutoff: 
                     end_s = time.monotonic() + 10
                 time.sleep(0.01)
             said = run.end([], work)
+            shutil.rmtree(out, ignore_errors=True)
             return {"dark_s": 99.0 if lit else 0.0, "reported": "guard" in said}
         while not simulation.light():
             if run.child.poll() is not None:
-                return {"dark_s": 0.0, "reported": True, "note": run.errors.read_text()[-200:]}
+                raise SystemExit(f"acquire ended before there was light: {run.errors.read_text()[-400:]}")
             time.sleep(0.005)
         time.sleep(random.uniform(0, 0.5))
         while not simulation.light() and run.child.poll() is None:
@@ -238,6 +240,8 @@ def once(number: int, faults: list[str], gap_s: float, discs: Discs, *, cutoff: 
         )
         discs.thaw()
         said = run.end(list({*guards, *run.guards()}), work)
+        # The disc is small.
+        shutil.rmtree(out, ignore_errors=True)
     words = ("guard", "acquire was", "acquire died", "disc", "LIGHT")
     reported = any(word in said for word in words)
     return {"dark_s": 8.0 if dark_s is None else dark_s, "reported": reported, "ended_s": ended_s}
