@@ -20,7 +20,7 @@ from processing.errors import ProcessError
 from processing.geometry.rusinkiewicz import Angles
 from processing.reflectance.table_axes import SHAPE, Layout, TableAxes
 from processing.storage.captures.nexus import add_group, add_scales, attach, declare, default_plot, describe_light
-from processing.storage.integrity.h5_door import damage_as, mark_of, open_h5, require_dataset
+from processing.storage.integrity.h5_door import damage_as, mark_of, open_h5, require_dataset, require_group
 from processing.storage.products.provenance import Step, read_steps, sign, write_steps
 
 #: 1 had everything in the root, without NeXus groups; up to 2 the errors were quantities with names of their own.
@@ -312,7 +312,7 @@ class ScatteringTable:
                     f"{path} has table version {a['umov_table']}; this program reads up to {SCHEMA_VERSION}."
                 )
             version = int(a["umov_table"])
-            data, sums = (h5, h5) if version == 1 else (h5["entry/data"], h5["entry/sums"])
+            data, sums = (h5 if version == 1 else require_group(h5, f"entry/{name}") for name in ("data", "sums"))
             names = [str(q) for q in a["quantities"]]
             quantities, has_noise, inputs = names, "u_noise" in data, [str(i) for i in a.get("inputs", ())]
             if version < 3 and names[1:2] == ["xi0_variance"]:

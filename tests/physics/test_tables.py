@@ -137,3 +137,14 @@ def test_what_does_not_belong_together_is_refused(tmp_path):
     (tmp_path / "no.h5").write_text("no")
     with pytest.raises(TableError, match="cannot be opened as HDF5"):
         ScatteringTable.load(tmp_path / "no.h5")
+
+
+def test_a_dataset_in_place_of_a_group_is_not_read_from_end_to_end(tmp_path):
+    table = ScatteringTable(("xi0",), 662)
+    table.add(Angles(*(np.array([0.3]) for _ in range(3))), np.array([[0.5]]))
+    table.save(tmp_path / "t.h5")
+    with h5py.File(tmp_path / "t.h5", "r+") as h5:
+        del h5["entry/data"]
+        h5.create_dataset("entry/data", (1 << 40,), chunks=(16,), dtype="f4")
+    with pytest.raises(TableError, match="no group entry/data"):
+        ScatteringTable.load(tmp_path / "t.h5")

@@ -7,7 +7,7 @@ import numpy as np
 
 from processing.doors import MOST_PIXELS
 from processing.storage.captures.schema import STATE_COLUMNS, CaptureHeader
-from processing.storage.integrity.h5_door import MOST_STATES, require_dataset
+from processing.storage.integrity.h5_door import MOST_STATES, require_dataset, require_group
 
 STATUSES = ("running", "complete", "aborted", "failed")
 #: Columns that the first version of the format did not have.
@@ -20,7 +20,7 @@ def check_capture(entry: h5py.Group, header: CaptureHeader) -> None:
     status = entry.attrs["status"]
     if (status.decode() if isinstance(status, bytes) else status) not in STATUSES:
         raise ValueError(f"the status {status!r} is none of {', '.join(STATUSES)}")
-    states = entry["states"]
+    states = require_group(entry, "states")
     n = int(require_dataset(states, "done", (None,), "u").shape[0])
     if n > MOST_STATES:
         raise ValueError(f"{n} states; at most {MOST_STATES} are read")
@@ -33,7 +33,7 @@ def check_capture(entry: h5py.Group, header: CaptureHeader) -> None:
     unknown = sorted(roles - set(ROLES))
     if unknown:
         raise ValueError(f"states/role holds {unknown[0]!r}, none of {', '.join(ROLES)}")
-    for name, group in entry["instrument"].items():
+    for name, group in require_group(entry, "instrument").items():
         if isinstance(group, h5py.Group) and group.attrs.get("NX_class") == "NXpositioner":
             for column in ("value", "target_value"):
                 require_dataset(entry["instrument"], f"{name}/{column}", (n,), "f")

@@ -151,6 +151,14 @@ def require_dataset(parent: h5py.Group, name: str, shape: Sequence[int | None], 
     return dataset
 
 
+def require_group(parent: h5py.Group, name: str) -> h5py.Group:
+    """A group of a group. Raises ValueError: `in` reads a dataset that stands in its place from end to end."""
+    group = parent.get(name)
+    if not isinstance(group, h5py.Group):
+        raise ValueError(f"there is no group {name}")
+    return group
+
+
 def _require_stored(dataset: h5py.Dataset, name: str) -> None:
     # A shape is a few bytes in the file and may promise any amount of memory.
     stored, size = dataset.id.get_storage_size(), int(np.prod(dataset.shape, dtype=object)) * dataset.dtype.itemsize

@@ -39,6 +39,7 @@ from processing.storage.integrity.h5_door import (
     mark_of,
     open_h5,
     require_dataset,
+    require_group,
     text_attribute,
 )
 from processing.storage.integrity.packed import Packing, create_packed, pack
@@ -299,13 +300,13 @@ class Product(OpenH5):
             raise ProductError(
                 f"{self.path} has product version {version}; this program reads up to {PRODUCT_VERSION}."
             )
-        entry = self._h5["entry"]
+        entry = require_group(self._h5, "entry")
         self.kind = text_attribute(entry, "kind")
         self.simulated = bool(entry.attrs["simulated"])
         self.header = CaptureHeader.model_validate_json(text_attribute(entry, "header_json"))
         self.facts: dict[str, Any] = dict(json.loads(text_attribute(entry, "facts_json")))
         self.steps = read_steps(entry)
-        data = entry["data"]
+        data = require_group(entry, "data")
         stored = [name for name in data if not _is_beside(name, data[name])]
         self._stored = {FORMER_NAMES.get(name, name): name for name in stored}
         self.names: tuple[str, ...] = tuple(self._stored)
