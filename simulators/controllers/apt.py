@@ -1,78 +1,88 @@
-"""Thorlabs APT units with a rotation stage: K10CR1, KDC101, KBD101; binary, with unsolicited messages."""
+"""Thorlabs APT units with a rotation stage, alone or in the bays of a rack; binary, with unsolicited messages."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
-from typing import Literal
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
 
+from drivers.apt_frames import BAY, HOST, RACK, UNIT
 from drivers.axes.apt import Config
 from simulators.clock import FastClock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
 
-HOST, UNIT = 0x01, 0x50
-# A rack answers at 0x11 and its bays from 0x21 on; these units are single ones.
-ADDRESSES = (UNIT, 0x11, 0x21)
 UPDATE_EVERY_S = 0.1
+BAYS_OF_A_RACK = 10
 
 
 class APTModel:
-    """What differs between the models: name, serial number, scale (counts per deg, deg/s, deg/s^2), stage id."""
+    """What differs between the models: name, serial number, scale (counts per deg, deg/s, deg/s^2), stage id.
+
+    Attributes
+    ----------
+    stage : str or None
+        What a rig file must say of the stage.
+    """
 
     def __init__(
-        self, name: str, hardware_type: int, serial_number: int, scale: tuple[float, float, float], *, stage_id: int
+        self,
+        name: str,
+        hardware_type: int,
+        serial_number: int,
+        scale: tuple[float, float, float],
+        *,
+        stage_id: int = 0,
+        stage: str | None = None,
     ) -> None:
         self.name = name
         self.hardware_type = hardware_type
         self.serial_number = serial_number
         self.per_deg, self.per_deg_s, self.per_deg_s2 = scale
         self.stage_id = stage_id
+        self.stage = stage
+        self.is_rack = name.startswith(("BSC2", "BBD2"))
         # Brushed and brushless servos send the same status.
-        self.is_dc = name.startswith(("KDC", "KBD"))
+        self.is_dc = name.startswith(("KDC", "KBD", "BBD"))
+        # Words for a second channel, and the host's address as 0 in the parameters of jogging (PnPQ).
+        self.is_k10cr2 = name == "K10CR2"
 
 
-def k10cr1() -> APTModel:
-    """Stepper rotation mount with its own controller."""
-    return APTModel("K10CR1", 16, 55000001, (409600 / 3, 7329109.0, 1502.0), stage_id=0)
+def _servo(counts_per_deg: float, sample_s: float) -> tuple[float, float, float]:
+    return counts_per_deg, counts_per_deg * 65536 * sample_s, counts_per_deg * 65536 * sample_s**2
 
 
-def kdc101() -> APTModel:
-    """DC servo controller with a PRM1-Z8 stage."""
-    per_deg, tick_s = 1919.6418578623391, 2048 / 6e6
-    return APTModel(
-        "KDC101", 44, 27000001, (per_deg, per_deg * 65536 * tick_s, per_deg * 65536 * tick_s**2), stage_id=6
-    )
+MOUNT = (409600 / 3, 7329109.0, 1502.0)
+# Worm gear 66:1.
+HEAVY = (409600 * 66 / 360, 409600 * 66 / 360 * 53.68, 409600 * 66 / 360 * 53.68 * 204.94e-6)
+MODELS: dict[str, Callable[[], APTModel]] = {
+    "apt-k10cr1": lambda: APTModel("K10CR1", 16, 55000001, MOUNT),
+    "apt-k10cr2": lambda: APTModel("K10CR2", 16, 55500001, MOUNT),
+    "apt-kdc101": lambda: APTModel("KDC101", 44, 27000001, _servo(1919.6418578623391, 2048 / 6e6), stage_id=6),
+    "apt-kbd101": lambda: APTModel("KBD101", 45, 28000001, _servo(4000.0, 102.4e-6), stage="DDR25"),
+    "apt-kst101": lambda: APTModel("KST101", 16, 26000001, HEAVY, stage="HDR50"),
+    "apt-bsc203": lambda: APTModel("BSC203", 16, 70000001, HEAVY, stage="HDR50"),
+    "apt-bbd203": lambda: APTModel("BBD203", 45, 73000001, _servo(3_276_800 / 360, 102.4e-6), stage="DDR100"),
+}
+START_DEG = {"apt-k10cr1": 33.0, "apt-kdc101": 12.0, "apt-kbd101": 57.0}
 
 
-def kbd101() -> APTModel:
-    """Brushless servo controller with a DDR25 stage, which it does not name."""
-    per_deg, sample_s = 1_440_000 / 360, 102.4e-6
-    return APTModel(
-        "KBD101", 45, 28000001, (per_deg, per_deg * 65536 * sample_s, per_deg * 65536 * sample_s**2), stage_id=0
-    )
+class APTUnit:
+    """One unit with one channel, at an address of its own.
 
+    Parameters
+    ----------
+    send : callable
+        Gets what the unit says.
+    """
 
-class APTEmulator(Emulator):
-    """One unit with one channel; `true_deg()` is the angle of its stage."""
-
-    pieces = (
-        b"\x53\x04\x06\x00\xd0\x01",
-        b"\x43\x04\x01\x00\x50\x01",
-        b"\x11\x00\x00\x00\x50\x01",
-        b"\x50\x01",
-        # A whole question so often that it is heard behind any length that noise has announced.
-        b"\x11\x04\x01\x00\x50\x01" * 50,
-    )
-    tells_limits = False
-
-    def __init__(
-        self, model: APTModel, axis: EmulatedAxis, clock: FastClock, faults: FaultSchedule | None = None
-    ) -> None:
-        super().__init__([axis], clock, faults)
+    def __init__(self, model: APTModel, axis: EmulatedAxis, address: int, send: Callable[[bytes], None]) -> None:
         self.model = model
         self.axis = axis
+        self.address = address
+        self._send = send
         self.enabled = True
         self.home_parameters = [2, 1, round(axis.speed_deg_s * model.per_deg_s), 0]
         # Settings that a host writes and reads back: id of the answer -> data behind the channel.
@@ -90,7 +100,6 @@ class APTEmulator(Emulator):
         self._moves_ends = 0
         self._home_ends = False
         self._updates_from_s: float | None = None
-        self._buffer = bytearray()
 
     def _counts(self, deg: float) -> int:
         return round(deg * self.model.per_deg)
@@ -113,27 +122,11 @@ class APTEmulator(Emulator):
             bits |= 1 << 10
         return bits
 
-    def _do_receive(self, data: bytes) -> None:
-        self._buffer += data
-        while len(self._buffer) >= 6:
-            message_id, length, destination, source = struct.unpack_from("<HHBB", self._buffer)
-            is_long = bool(destination & 0x80)
-            if destination & 0x7F not in ADDRESSES or source != HOST or (is_long and length > 255):
-                del self._buffer[0]
-                continue
-            total = 6 + (length if is_long else 0)
-            if len(self._buffer) < total:
-                return
-            message = bytes(self._buffer[:total])
-            del self._buffer[:total]
-            if destination & 0x7F != 0x11:
-                self._command(message_id, message)
-
-    def _command(self, message_id: int, message: bytes) -> None:
-        self._apply_faults()
+    def command(self, message_id: int, message: bytes) -> None:
+        """Do one message; a real unit does not answer what it does not know."""
         data = message[6:]
         handlers: dict[int, Callable[[bytes, bytes], None]] = {
-            0x0005: lambda *_: self._send_long(0x0006, self._hardware_info()),
+            0x0005: lambda *_: self._send_long(0x0006, hardware_info(self.model)),
             0x0011: lambda *_: self._set_updates(True),
             0x0012: lambda *_: self._set_updates(False),
             0x0210: self._set_enabled,
@@ -159,25 +152,17 @@ class APTEmulator(Emulator):
             handlers[message_id](message, data)
         elif message_id + 2 in self.stored or message_id + 1 in self.stored:
             self._store_or_tell(message_id, data)
-        # A real unit does not answer what it does not know.
 
     def _send_short(self, message_id: int, first: int, second: int = 0) -> None:
-        self._reply(struct.pack("<HBBBB", message_id, first, second, HOST, UNIT))
+        self._send(struct.pack("<HBBBB", message_id, first, second, HOST, self.address))
 
     def _send_long(self, message_id: int, data: bytes) -> None:
-        self._reply(struct.pack("<HHBB", message_id, len(data), HOST | 0x80, UNIT) + data)
-
-    def _hardware_info(self) -> bytes:
-        model = self.model
-        notes = b"APT unit (emulated)"
-        # qmi and pylablib read hardware version, modification and channels from the last three words.
-        return struct.pack(
-            "<I8sH4s48s8sHHHHH", model.serial_number, model.name.encode()[:8], model.hardware_type, b"\x03\x00\x01\x00",
-            notes, b"", 0, 0, 1, 1, 1,
-        )[:76] + struct.pack("<HHHH", model.stage_id, 1, 1, 1)  # fmt: skip
+        host = 0 if self.model.is_k10cr2 and message_id == 0x0418 else HOST
+        self._send(struct.pack("<HHBB", message_id, len(data), host | 0x80, self.address) + data)
 
     def _stepper_status(self) -> bytes:
-        return struct.pack("<HiiI", 1, self.position(), 0, self.status_bits())
+        more = struct.pack("<Hiii", 1, 0, 0, 0) if self.model.is_k10cr2 else b""
+        return struct.pack("<HiiI", 1, self.position(), 0, self.status_bits()) + more
 
     def _dc_status(self) -> bytes:
         velocity = round(abs(self.axis.velocity_deg_s()) * self.model.per_deg_s / 65536) & 0xFFFF
@@ -220,7 +205,7 @@ class APTEmulator(Emulator):
         self.enabled = message[3] == 1
 
     def _set_updates(self, on: bool) -> None:
-        self._updates_from_s = self.clock.now_s() if on else None
+        self._updates_from_s = self.axis.clock.now_s() if on else None
 
     def _home(self, *_: bytes) -> None:
         # A homing speed of zero makes homing look dead, as on the real unit.
@@ -253,60 +238,125 @@ class APTEmulator(Emulator):
         self.axis.stop()
         self._moves_ends, self._home_ends = 0x0466, False
 
-    def _do_make_foreign(self, reply: bytes) -> bytes:
-        # The answer to another question: a channel state nobody asked for.
-        return struct.pack("<HBBBB", 0x0212, 1, 1, HOST, 0x22)
-
-    def _do_advance(self) -> None:
-        moving = self.axis.is_moving()
+    def advance(self) -> None:
+        """Say what is due by now: the end of a motion, the periodic status."""
+        moving, now_s = self.axis.is_moving(), self.axis.clock.now_s()
         if self._home_ends and not moving:
             self._home_ends = False
             self._send_short(0x0444, 1)
         if self._moves_ends and not moving:
             message_id, self._moves_ends = self._moves_ends, 0
             self._send_long(message_id, self._status())
-        if self._updates_from_s is not None and self.clock.now_s() >= self._updates_from_s + UPDATE_EVERY_S:
-            self._updates_from_s = self.clock.now_s()
+        if self._updates_from_s is not None and now_s >= self._updates_from_s + UPDATE_EVERY_S:
+            self._updates_from_s = now_s
             self._send_long(0x0491 if self.model.is_dc else 0x0481, self._status())
 
-    def _do_next_event_s(self) -> float | None:
+    def events_s(self) -> list[float]:
+        """Simulated times at which it has something to say."""
         times = [self.axis.end_s()] if self._home_ends or self._moves_ends else []
         if self._updates_from_s is not None:
             times.append(self._updates_from_s + UPDATE_EVERY_S)
-        return min(times) if times else None
+        return times
 
 
-def _make(options: ServeOptions, model: APTModel, start_deg: float) -> APTEmulator:
+def hardware_info(model: APTModel) -> bytes:
+    """Answer of a unit or of a rack to the question who it is."""
+    notes = b"APT unit (emulated)"
+    # qmi and pylablib read hardware version, modification and channels from the last three words.
+    return struct.pack(
+        "<I8sH4s48s8sHHHHH", model.serial_number, model.name.encode()[:8], model.hardware_type, b"\x03\x00\x01\x00",
+        notes, b"", 0, 0, 1, 1, 1,
+    )[:76] + struct.pack("<HHHH", model.stage_id, 1, 1, 1)  # fmt: skip
+
+
+class APTEmulator(Emulator):
+    """One unit, or a rack with a unit in each of its first bays; `true_deg(i)` is the angle of the i-th stage."""
+
+    pieces = (
+        b"\x53\x04\x06\x00\xd0\x01",
+        b"\x43\x04\x01\x00\x50\x01",
+        b"\x11\x00\x00\x00\x50\x01",
+        b"\x50\x01",
+        # A whole question so often that it is heard behind any length that noise has announced.
+        b"\x11\x04\x01\x00\x50\x01" * 50,
+        b"\x11\x04\x01\x00\x21\x01" * 50,
+    )
+    tells_limits = False
+
+    def __init__(
+        self, model: APTModel, axes: Sequence[EmulatedAxis], clock: FastClock, faults: FaultSchedule | None = None
+    ) -> None:
+        super().__init__(axes, clock, faults)
+        self.model = model
+        first = BAY if model.is_rack else UNIT
+        self.units = [APTUnit(model, axis, first + index, self._reply) for index, axis in enumerate(axes)]
+        # A single unit also listens to the addresses of a rack's first bay.
+        self._at = {unit.address: unit for unit in self.units}
+        if not model.is_rack:
+            self._at[BAY] = self.units[0]
+        self._buffer = bytearray()
+
+    def _do_receive(self, data: bytes) -> None:
+        self._buffer += data
+        while len(self._buffer) >= 6:
+            message_id, length, destination, source = struct.unpack_from("<HHBB", self._buffer)
+            is_long = bool(destination & 0x80)
+            if destination & 0x7F not in (RACK, *self._at) or source != HOST or (is_long and length > 255):
+                del self._buffer[0]
+                continue
+            total = 6 + (length if is_long else 0)
+            if len(self._buffer) < total:
+                return
+            message = bytes(self._buffer[:total])
+            del self._buffer[:total]
+            self._apply_faults()
+            if destination & 0x7F in self._at:
+                self._at[destination & 0x7F].command(message_id, message)
+            elif self.model.is_rack:
+                self._rack(message_id, message)
+
+    def _rack(self, message_id: int, message: bytes) -> None:
+        """What the rack itself answers: who it is, and which bays hold a unit."""
+        if message_id == 0x0005:
+            info = hardware_info(self.model)
+            self._reply(struct.pack("<HHBB", 0x0006, len(info), HOST | 0x80, RACK) + info)
+        elif message_id == 0x0060 and message[2] < BAYS_OF_A_RACK:
+            state = 1 if message[2] < len(self.units) else 2
+            self._reply(struct.pack("<HBBBB", 0x0061, message[2], state, HOST, RACK))
+
+    def _do_make_foreign(self, reply: bytes) -> bytes:
+        # The answer to another question: a channel state nobody asked for.
+        return struct.pack("<HBBBB", 0x0212, 1, 1, HOST, 0x22)
+
+    def _do_advance(self) -> None:
+        for unit in self.units:
+            unit.advance()
+
+    def _do_next_event_s(self) -> float | None:
+        return min((time_s for unit in self.units for time_s in unit.events_s()), default=None)
+
+
+def _make(kind: str, options: ServeOptions) -> APTEmulator:
     low, high = options.limits_deg or (None, None)
-    if options.axes not in (None, 1):
-        raise ValueError("an APT unit has one axis, and a port of its own")
+    model = MODELS[kind]()
+    count = options.axes or 1
+    if count > (3 if model.is_rack else 1):
+        raise ValueError("an APT unit has one axis, and a port of its own; a rack has up to three")
     if options.model is not None:
         model.name = options.model
-    axis = options.axis(low, high, start_deg)
-    # The protocol's 32 bits hold no more (293 deg/s on a K10CR1).
-    axis.speed_deg_s = min(axis.speed_deg_s, 0.99 * 2**31 / model.per_deg_s)
-    return APTEmulator(model, axis, options.clock, options.faults)
-
-
-def make_k10cr1(options: ServeOptions) -> APTEmulator:
-    """A K10CR1 with a serial number that starts with 55."""
-    return _make(options, k10cr1(), 33.0)
-
-
-def make_kdc101(options: ServeOptions) -> APTEmulator:
-    """A KDC101 with a PRM1-Z8, serial number starting with 27."""
-    return _make(options, kdc101(), 12.0)
-
-
-def make_kbd101(options: ServeOptions) -> APTEmulator:
-    """A KBD101 with a DDR25, serial number starting with 28."""
-    return _make(options, kbd101(), 57.0)
+    axes = [options.axis(low, high, START_DEG.get(kind, 20.0)) for _ in range(count)]
+    for axis in axes:
+        # The protocol's 32 bits hold no more (293 deg/s on a K10CR1).
+        axis.speed_deg_s = min(axis.speed_deg_s, 0.99 * 2**31 / model.per_deg_s)
+    return APTEmulator(model, axes, options.clock, options.faults)
 
 
 def axis_configs(emulator: APTEmulator, port: str) -> list[Config]:
-    """Rig entry for the unit."""
-    stage: Literal["DDR25"] | None = "DDR25" if emulator.model.name == "KBD101" else None
-    return [Config(port=port, serial_number=emulator.model.serial_number, stage=stage)]
+    """Rig entries for the unit, or for every unit of the rack."""
+    model = emulator.model
+    entry: dict[str, Any] = {"port": port, "serial_number": model.serial_number, "stage": model.stage}
+    bays = range(1, len(emulator.units) + 1) if model.is_rack else (None,)
+    return [Config(**entry, bay=bay) for bay in bays]
 
 
-SERVES = {"apt-k10cr1": make_k10cr1, "apt-kdc101": make_kdc101, "apt-kbd101": make_kbd101}
+SERVES = {kind: partial(_make, kind) for kind in MODELS}

@@ -48,7 +48,7 @@ def test_a_note_about_an_interrupted_move_is_only_a_note() -> None:
 @pytest.mark.parametrize(
     ("kind", "model", "word"),
     [
-        ("apt-k10cr1", "K10CR2", "treated as K10CR1"),
+        ("apt-k10cr1", "K10CR3", "treated as K10CR1"),
         ("elliptec", "ELL22", "treated as ELL14"),
         ("smc100", "FCL", "SMC100"),
     ],
@@ -60,7 +60,7 @@ def test_an_unknown_but_compatible_model_warns(kind: str, model: str, word: str)
 
 
 def test_known_models_do_not_warn() -> None:
-    for kind in ("apt-k10cr1", "apt-kdc101", "elliptec", "smc100", "zaber"):
+    for kind in ("apt-k10cr1", "apt-k10cr2", "apt-kdc101", "elliptec", "smc100", "zaber"):
         with opened(kind) as (_, axis):
             assert axis.warnings() == []
 
@@ -81,10 +81,10 @@ def test_homing_with_a_speed_of_zero_is_refused_and_can_be_set() -> None:
     from drivers.errors import CommandRejected
 
     with opened("apt-k10cr1") as (emulator, axis):
-        emulator.home_parameters[2] = 0  # type: ignore[attr-defined]
+        emulator.units[0].home_parameters[2] = 0  # type: ignore[attr-defined]
         with pytest.raises(CommandRejected, match="stand still"):
             axis.home()
     with opened("apt-k10cr1", home_speed_deg_s=90.0) as (emulator, axis):
-        emulator.home_parameters[2] = 0  # type: ignore[attr-defined]
+        emulator.units[0].home_parameters[2] = 0  # type: ignore[attr-defined]
         axis.home().wait()
         assert axis.is_homed()

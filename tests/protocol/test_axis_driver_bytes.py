@@ -144,6 +144,14 @@ def test_apt_bytes() -> None:
         axis.stop()
 
 
+def test_both_lengths_of_an_apt_status_are_frames() -> None:
+    # PnPQ's tests have these: a status of 20 bytes, and the 34 of a K10CR2.
+    short = bytes.fromhex("81040e0081220100010000000000000007000000")
+    long = bytes.fromhex("81041c00812201000100000000000000070000000100000000000000000000000000")
+    buffer = bytearray(long + short)
+    assert [apt_framer(buffer), apt_framer(buffer), apt_framer(buffer)] == [long, short, None]
+
+
 def test_apt_frames_are_found_in_noise() -> None:
     reply = bytes.fromhex("2a04060081500100 00040080")
     buffer = bytearray(b"\x2a\x04\xff\xff\x81" + reply + reply[:5])

@@ -200,6 +200,30 @@ def test_apt_dc_servo_and_its_periodic_status() -> None:
     assert unit.take_output() == b""
 
 
+def test_apt_rack_and_its_bays() -> None:
+    rack, clock = emulator("apt-bsc203", axes=2)
+    info = talk(rack, h("05 00 00 00 11 01"))
+    assert info[:6] == h("06 00 54 00 81 11")
+    assert info[10:18] == b"BSC203\0\0"
+    # The bays from 0 on: occupied, occupied, empty.
+    for bay, state in ((0, 1), (1, 1), (2, 2)):
+        assert talk(rack, bytes((0x60, 0, bay, 0, 0x11, 1))) == bytes((0x61, 0, bay, state, 1, 0x11))
+    assert talk(rack, h("11 04 01 00 23 01")) == b""
+    assert talk(rack, h("43 04 01 00 22 01")) == b""
+    assert run_out(rack, clock) == h("44 04 01 00 01 22")
+    talk(rack, h("53 04 06 00 a2 01 01 00 00 08 00 00"))
+    assert run_out(rack, clock)[:6] == h("64 04 0e 00 81 22")
+    assert talk(rack, h("11 04 01 00 22 01")) == h("12 04 06 00 81 22 01 00 00 08 00 00")
+    assert talk(rack, h("11 04 01 00 21 01")) == h("12 04 06 00 81 21 01 00 00 00 00 00")
+
+
+def test_a_k10cr2_sends_a_longer_status_and_a_malformed_address() -> None:
+    unit, _ = emulator("apt-k10cr2", homed=True)
+    status = talk(unit, h("80 04 01 00 50 01"))
+    assert (status[:6], len(status)) == (h("81 04 1c 00 81 50"), 6 + 28)
+    assert talk(unit, h("17 04 01 00 50 01"))[:6] == h("18 04 16 00 80 50")
+
+
 def test_apt_homing_speed_of_zero_looks_dead() -> None:
     unit, clock = emulator("apt-k10cr1")
     before = unit.true_deg(0)
@@ -262,6 +286,7 @@ QUESTIONS = {
     "standa": b"gser",
     "apt-k10cr1": bytes.fromhex("110401005001"),
     "apt-kdc101": bytes.fromhex("900401005001"),
+    "apt-bbd203": bytes.fromhex("900401002101"),
     "apt-kbd101": bytes.fromhex("900401005001"),
 }
 

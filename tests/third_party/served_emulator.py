@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 
@@ -14,8 +15,8 @@ from simulators.serial.tcp_port import port_for
 
 
 @contextmanager
-def served(kind: str, speed: float = 20.0) -> Iterator[tuple[Emulator, str]]:
-    emulator = served_kinds()[kind](ServeOptions(clock=FastClock(speed)))
+def served(kind: str, speed: float = 20.0, **options: Any) -> Iterator[tuple[Emulator, str]]:
+    emulator = served_kinds()[kind](ServeOptions(clock=FastClock(speed), **options))
     with port_for(emulator) as port:
         yield emulator, port.path
 

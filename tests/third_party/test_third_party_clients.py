@@ -57,18 +57,28 @@ def test_pylablib_elliptec() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "scale"), [("apt-k10cr1", "K10CR1"), ("apt-kdc101", "stage"), ("apt-kbd101", "DDR25")]
+    ("kind", "scale"),
+    [
+        ("apt-k10cr1", "K10CR1"),
+        ("apt-k10cr2", (409600 / 3, 7329109.0, 1502.0)),
+        ("apt-kdc101", "stage"),
+        ("apt-kbd101", "DDR25"),
+        ("apt-kst101", "NR360"),
+        ("apt-bsc203", "NR360"),
+        ("apt-bbd203", "DDR100"),
+    ],
 )
-def test_pylablib_kinesis(kind: str, scale: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pylablib_kinesis(kind: str, scale: object, monkeypatch: pytest.MonkeyPatch) -> None:
     from pylablib.devices import Thorlabs
     from pylablib.devices.Thorlabs import kinesis
 
     # It toggles RTS, which a pseudo-terminal does not have.
     monkeypatch.setattr(kinesis.BasicKinesisDevice, "_cycle_rts", staticmethod(lambda instr: None))
     with served(kind) as (emulator, path):
-        motor = Thorlabs.KinesisMotor(("serial", path), scale=scale)
+        rack = kind in ("apt-bsc203", "apt-bbd203")
+        motor = Thorlabs.KinesisMotor(("serial", path), scale=scale, is_rack_system=rack)
         try:
-            assert motor.get_scale_units() == "deg"
+            assert motor.get_scale_units() == ("user" if isinstance(scale, tuple) else "deg")
             motor.home()
             motor.wait_for_home()
             assert motor.is_homed()
@@ -78,10 +88,8 @@ def test_pylablib_kinesis(kind: str, scale: str, monkeypatch: pytest.MonkeyPatch
             motor.wait_move()
             assert motor.get_position() == pytest.approx(-20, abs=0.01)
             assert emulator.true_deg(0) == pytest.approx(-20, abs=0.01)
-            assert (
-                motor.get_full_info()["device_info"].serial_no // 1_000_000
-                == {"K10CR1": 55, "stage": 27, "DDR25": 28}[scale]
-            )
+            serial_number = motor.get_full_info()["device_info"].serial_no
+            assert emulator.model.serial_number == serial_number
         finally:
             motor.close()
 
@@ -102,6 +110,28 @@ def test_thorlabs_apt_device() -> None:
             assert emulator.true_deg(0) == pytest.approx(-10_804 / 1919.6418578623391)
         finally:
             unit.close()
+            time.sleep(0.3)
+
+
+@pytest.mark.parametrize(("kind", "name"), [("apt-bsc203", "BSC"), ("apt-bbd203", "BBD203")])
+def test_thorlabs_apt_device_and_the_bays_of_a_rack(kind: str, name: str) -> None:
+    from thorlabs_apt_device.devices import bbd, bsc
+
+    with served(kind, speed=4.0, axes=3) as (emulator, path):
+        more = {"x": 3} if name == "BSC" else {}
+        rack = getattr(bsc if name == "BSC" else bbd, name)(serial_port=path, home=False, **more)
+        try:
+            for bay in (1, 2):
+                status = rack.status_[bay][0]
+                wait_until("first status", lambda status=status: status["msg"] != "")
+                rack.home(bay=bay)
+                wait_until("homed", lambda status=status: status["homed"] and not status["homing"])
+                rack.move_absolute(bay * 20_000, bay=bay)
+                wait_until("target", lambda status=status, bay=bay: status["position"] == bay * 20_000)
+            assert [emulator.true_deg(bay) * emulator.model.per_deg for bay in (1, 2)] == pytest.approx([2e4, 4e4])
+            assert not emulator.axes[0].homed
+        finally:
+            rack.close()
             time.sleep(0.3)
 
 
