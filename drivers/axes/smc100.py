@@ -81,6 +81,9 @@ class Config(AxisConfig):
     address: int = Field(default=1, ge=1, le=31, description="address on the line")
     stage_id: str | None = Field(default=None, description="name of the stage that the controller reports")
     baudrate: int = Field(default=57_600, description="57600 for SMC100, 921600 for CONEX")
+    speed_deg_s: float | None = Field(
+        default=None, gt=0, description="speed of a CONEX-AGP, which tells none; for deadlines"
+    )
 
     def place(self) -> str:
         return f"address {self.address}"
@@ -153,8 +156,15 @@ class SMC100Axis(MotionAxis):
                 f"its stage identifier is {stage!r}",
                 "Correct stage_id, port or address in the rig file",
             )
-        self.speed_deg_s = self._constant("VA?")
-        self.acceleration_deg_s2 = self._constant("AC?")
+        if "AGP" in version.upper():
+            # Its piezo has neither command (EPICS motorNewport).
+            if config.speed_deg_s is None:
+                raise WrongDevice(
+                    f"axis {name}, speed", f"a {version} does not tell it", "State speed_deg_s in the rig file"
+                )
+            self.speed_deg_s, self.acceleration_deg_s2 = config.speed_deg_s, 10 * config.speed_deg_s
+        else:
+            self.speed_deg_s, self.acceleration_deg_s2 = self._constant("VA?"), self._constant("AC?")
         if min(self.speed_deg_s, self.acceleration_deg_s2) <= 0:
             raise ReplyError(f"axis {name}, speed", "speed or acceleration is zero", "Set VA and AC of the controller")
         self._device_min_deg = self._constant("SL?")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from drivers.axes.smc100 import Config
 from simulators.clock import FastClock
@@ -111,6 +111,8 @@ class SMC100Controller:
             "RS": self._reset,
             "PW": self._configure,
         }
+        if letters in ("VA", "AC") and "AGP" in self.version:
+            raise Smc100Error("D")
         if letters in self.settings:
             return self._keep(letters, value)
         if letters not in handlers:
@@ -322,7 +324,16 @@ def make(options: ServeOptions) -> SMC100Emulator:
 
 def axis_configs(emulator: SMC100Emulator, port: str) -> list[Config]:
     """Rig entries for every controller on the line."""
-    return [Config(port=port, address=address) for address in emulator.controllers]
+    entries = []
+    for address, controller in emulator.controllers.items():
+        told = controller.axis.speed_deg_s if "AGP" in controller.version else None
+        entries.append(Config(port=port, address=address, speed_deg_s=told))
+    return entries
 
 
-SERVES = {"smc100": make}
+def make_agp(options: ServeOptions) -> SMC100Emulator:
+    """A CONEX-AGP, which knows neither speed nor acceleration."""
+    return make(replace(options, model=options.model or "CONEX-AGP"))
+
+
+SERVES = {"smc100": make, "conex-agp": make_agp}

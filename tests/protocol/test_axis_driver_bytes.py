@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.apt_frames import apt_framer
-from drivers.axes import apt, elliptec, esp301, gcs2, smc100, zaber
-from drivers.errors import CommandRejected, NotHomedError, ReplyError
+from drivers.axes import apt, elliptec, esp301, gcs2, gsc, owis, smc100, zaber
+from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
 from drivers.serial_link import LONGEST_FRAME, LineRegistry, line_framer
 from simulators.clock import FastClock, patient_clock
 from simulators.controllers import esp301 as esp301_emulator
@@ -45,6 +45,73 @@ def test_zaber_exchange_sorts_out_what_is_not_its_reply() -> None:
         with pytest.raises(CommandRejected, match="BADCOMMAND"):
             line.ask(2, 1, "fly", repeat=False)
         line.close()
+
+
+def test_gsc_moves_are_relative_and_asked_for() -> None:
+    rest, taken = (b"Q:\r\n", b"-      400,       20,K,K,R\r\n"), (b"Q:\r\n", b"OK\r\n-      400,       20,K,K,B\r\n")
+    with (
+        scripted(
+            (b"?:V\r\n", b"V1.10\r\n"),
+            rest,
+            *[rest] * 8,
+            (b"M:1+P1200\r\n", b""),
+            taken,
+            (b"G:\r\n", b""),
+            (b"Q:\r\n", b"-      400,       20,X,L,R\r\n"),
+            (b"L:1\r\n", b""),
+        ) as path,
+        LineRegistry(clock=patient_clock()) as lines,
+    ):
+        axis = gsc.open("psg", gsc.Config(port=path, assume_homed=True, rtscts=False), lines)
+        assert (axis.read_position().deg, axis.is_homed()) == (-1.0, True)
+        with pytest.raises(CommandRejected, match="G:: the controller refuses it"):
+            axis._do_start_move(800.0)
+        axis.stop()
+        with pytest.raises(WrongDevice, match="moves one at a time"):
+            gsc.open("psa", gsc.Config(port=path, axis=2), lines)
+
+
+def test_owis_makes_an_axis_ready_before_it_goes() -> None:
+    def at(letters: bytes) -> tuple[bytes, bytes]:
+        return b"?ASTAT\r", letters + b"\r"
+
+    with (
+        scripted(
+            (b"?VERSION\r", b"PS90-V6.2-240219\r"),
+            *[at(b"RO")] * 2,
+            at(b"RO"),
+            (b"INIT2\r", b""),
+            at(b"RO"),
+            at(b"RR"),
+            (b"ABSOL2\rPSET2=-4500\rPGO2\r", b""),
+            *[at(b"RT")] * 2,
+            (b"STOP2\r", b""),
+            *[at(b"RL")] * 2,
+        ) as path,
+        LineRegistry(clock=patient_clock()) as lines,
+    ):
+        entry = owis.Config(port=path, axis=2, counts_per_deg=100, speed_deg_s=10, assume_homed=True)
+        axis = owis.open("psa", entry, lines)
+        axis._do_start_move(-4500.0)
+        assert axis.is_moving()
+        axis.stop()
+        with pytest.raises(CommandRejected, match="disabled at a limit switch"):
+            axis.check_fault()
+
+
+def test_the_speed_of_a_conex_agp_is_that_of_the_rig_file() -> None:
+    with (
+        scripted(
+            *[(b"1VE\r\n", b"1VE CONEX-AGP 2.0.0\r\n"), (b"1ID?\r\n", b"1IDAG-PR100P\r\n")] * 2,
+            *[(b"1SL?\r\n", b"1SL-170\r\n")] * 2,
+            *[(b"1SR?\r\n", b"1SR170\r\n")] * 2,
+        ) as path,
+        LineRegistry(clock=patient_clock()) as lines,
+    ):
+        with pytest.raises(WrongDevice, match="speed_deg_s"):
+            smc100.open("psg", smc100.Config(port=path), lines)
+        axis = smc100.open("psg", smc100.Config(port=path, speed_deg_s=2.0), lines)
+        assert (axis.speed_deg_s, axis.acceleration_deg_s2) == (2.0, 20.0)
 
 
 def elliptec_after(*pairs: tuple[bytes, bytes]) -> list[tuple[bytes, bytes]]:

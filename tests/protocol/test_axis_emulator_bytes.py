@@ -277,7 +277,66 @@ def test_gcs2() -> None:
     assert talk(box, b"FLY 1\nERR?\nMOV 7 1\nERR?\nMOV 1\nERR?\n") == b"2\n15\n1\n"
 
 
+def test_gsc_sets_a_move_and_drives_it() -> None:
+    box, clock = emulator("gsc-01")
+    for sent, came in (
+        (b"?:V\r\n", b"V1.10\r\n"),
+        (b"H:1\r\n", b"OK\r\n"),
+        (b"M:1+P400\r\n", b"NG\r\n"),
+        (b"!:\r\n", b"B\r\n"),
+    ):
+        assert talk(box, sent) == came
+    clock.sleep_s(60.0)
+    assert talk(box, b"Q:\r\n") == b"         0,X,K,R\r\n"
+    assert talk(box, b"G:\r\n") == b"NG\r\n"
+    assert talk(box, b"M:1-P4000\r\nG:\r\nQ:\r\n") == b"OK\r\nOK\r\n         0,K,K,B\r\n"
+    clock.sleep_s(60.0)
+    assert talk(box, b"Q:\r\n") == b"-     4000,K,K,R\r\n"
+    assert talk(box, b"A:1+P20000000\r\n") == b"NG\r\n"
+    assert box.true_deg(0) == -10.0
+
+
+def test_a_gsc_02_is_silent_and_must_be_told_the_way_home() -> None:
+    box, clock = emulator("gsc-02")
+    assert talk(box, b"H:1\r\nQ:\r\n") == b"         0,         0,X,K,R\r\n"
+    assert talk(box, b"H:W--\r\nQ:\r\n").endswith(b",K,K,B\r\n")
+    # Only what is meant for all axes ends homing.
+    assert talk(box, b"L:1\r\nQ:\r\n").endswith(b",K,K,B\r\n")
+    assert talk(box, b"L:W\r\n") == b""
+    clock.sleep_s(60.0)
+    assert not box.axes[0].homed
+    assert talk(box, b"M:W+P400-P800\r\nG\r\n") == b""
+    clock.sleep_s(60.0)
+    assert talk(box, b"Q:\r\n") == b"       400,-      800,K,K,R\r\n"
+
+
+def test_owis_states_and_targets() -> None:
+    unit, clock = emulator("owis", axes=2)
+    assert talk(unit, b"?VERSION\r").startswith(b"PS90")
+    # Off; a target that is set is not gone to.
+    assert talk(unit, b"?ASTAT\r") == b"OO\r"
+    assert talk(unit, b"PSET1=5000\rPGO1\r?ASTAT\r") == b"OO\r"
+    assert talk(unit, b"INIT1\r?ASTAT\r") == b"RO\r"
+    assert talk(unit, b"REF1=4\r?ASTAT\r") == b"PO\r"
+    clock.sleep_s(60.0)
+    assert talk(unit, b"PGO1\r?ASTAT\r") == b"TO\r"
+    clock.sleep_s(60.0)
+    assert talk(unit, b"?CNT1\r?PSET1\r") == b"5000\r5000\r"
+    assert talk(unit, b"RELAT1\rPSET1=-1000\rPGO1\r") == b""
+    clock.sleep_s(60.0)
+    assert unit.true_deg(0) == 4.0
+    assert talk(unit, b"?CNT9\rPGO\rnonsense\r") == b""
+
+
+def test_a_conex_agp_knows_no_speed() -> None:
+    box, _ = emulator("conex-agp")
+    assert talk(box, b"1VE\r\n").startswith(b"1VE CONEX-AGP")
+    assert talk(box, b"1VA?\r\n1TE\r\n") == b"1TED\r\n"
+
+
 QUESTIONS = {
+    "gsc-01": b"Q:\r\n",
+    "owis": b"?ASTAT\r",
     "zaber": b"/1 1 07 get limit.max\n",
     "elliptec": b"1gp",
     "smc100": b"1TS\r\n",

@@ -205,3 +205,49 @@ def test_pipython() -> None:
             controller.StopAll(noraise=True)
         finally:
             gateway.close()
+
+
+def test_pysigmakoki() -> None:
+    package = pytest.importorskip("sigma_koki")
+    with served("gsc-02") as (emulator, path):
+        box = package.GSC02()
+        box.open(path)
+        try:
+            box.returnToMechanicalOrigin("-", "-")
+            box.waitForReady(10)
+            assert [axis.homed for axis in emulator.axes] == [True, True]
+            box.setSpeed(True, 100, 5000, 200, 100, 5000, 200)
+            box.move_absolute(4000, -2000)
+            box.waitForReady(10)
+            box.move_relative(-400, 400)
+            box.waitForReady(10)
+            assert (emulator.true_deg(0), emulator.true_deg(1)) == (9.0, -4.0)
+            assert box.getVersion() == "V1.10"
+            box.jog("+", "")
+            wait_until("jog", lambda: emulator.true_deg(0) > 9.0)
+            box.stop()
+            wait_until("rest", lambda: not emulator.axes[0].is_moving())
+        finally:
+            box.close()
+
+
+def test_pyoptosigma() -> None:
+    package = pytest.importorskip("pyOptoSigma")
+    with served("gsc-01") as (emulator, path):
+        session = package.Session(package.Controllers.SHOT_302GS, wait_time=0.05)
+        session.append_stage(package.Stages.SGSP_60YAW)
+        session.connect(path)
+        try:
+            session.reset(1, mechanical=True, wait_for_finish=True)
+            assert emulator.axes[0].homed
+            # In thousandths of a degree.
+            session.move(stage=1, amount=10_000, absolute=True)
+            session.move(stage=1, amount=-2000)
+            assert emulator.true_deg(0) == 8.0
+            session.set_speed(1, 100, 4000, 200)
+            session.jog(1, 1)
+            wait_until("jog", lambda: emulator.true_deg(0) > 8.0)
+            session.stop(1)
+            wait_until("rest", lambda: not session.is_busy())
+        finally:
+            session.port.close()

@@ -1,0 +1,180 @@
+"""OptoSigma (Sigma Koki) GSC-01, GSC-02 and other controllers with SHOT commands, and rotation stages.
+
+Facts: the public drivers elerac/optosigma (which quotes the manuals of GSC-01 and GSC-02), pysigmakoki, PyOptoSigma and
+pymodaq_plugins_optosigma. Moves are relative, because a GSC-02 has no others. The controller tells neither speed nor
+limits, nor whether it is homed, and it takes no move while one of its axes moves: one axis of it can be in a rig.
+Unverified on hardware: everything; that a GSC-01 keeps the result of a command until the next.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from typing import ClassVar, Literal, NamedTuple
+
+from pydantic import Field
+
+from drivers.clock import Clock
+from drivers.errors import CommandRejected, WrongDevice
+from drivers.motion import AxisIdentity
+from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
+from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
+from drivers.text_line import TextLine
+
+# Pulses a second, and milliseconds from start to this speed: the homing of a GSC-01 and a GSC-02.
+HOMING_PPS = 5000
+_STATUS = re.compile(r"\s*([+-]?\s*\d+\s*,\s*)+[XK],[KLMW],[BR]")
+_VERSION = re.compile(r"(?!OK$|NG$)[\w .-]+")
+# At a limit switch: the first axis, the second, both.
+_AT_LIMIT = {"L": (1,), "M": (2,), "W": (1, 2)}
+
+
+class Config(SessionReferenceConfig):
+    """A SHOT controller's axis in a rig file."""
+
+    identified_by: ClassVar[str] = "firmware"
+
+    kind: Literal["gsc"] = "gsc"
+    axis: int = Field(default=1, ge=1, le=4, description="number of the axis at its controller")
+    firmware: str | None = Field(default=None, description="what the controller answers to ?:V")
+    pulses_per_deg: float = Field(default=400.0, gt=0, description="pulses of a degree; 400 for OSMS-60YAW")
+    speed_pps: float = Field(default=5000.0, gt=0, description="speed of moves as set, pulses a second, for deadlines")
+    acceleration_s: float = Field(default=0.2, gt=0, description="time to that speed, as set")
+    home_direction: Literal["+", "-"] | None = Field(
+        default=None, description="way to the origin, which a GSC-02 must be told and other controllers know"
+    )
+    baudrate: int = Field(default=9600, description="bits a second, as the controller is set")
+    rtscts: bool = Field(default=True, description="whether the wires RTS and CTS hold back who sends too fast")
+
+    def place(self) -> str:
+        return f"axis {self.axis}"
+
+
+class ShotStatus(NamedTuple):
+    """Answer to ``Q:``: pulses of each axis, whether the last command was taken, limit switches, whether it moves."""
+
+    pulses: list[int]
+    taken: bool
+    at_limit: str
+    busy: bool
+
+
+class GSCAxis(SessionReferenceAxis):
+    """The axis of a controller."""
+
+    def __init__(self, name: str, config: Config, line: TextLine, lines: LineRegistry) -> None:
+        super().__init__(name, config, lines.clock)
+        self.config: Config = config
+        self._line, self._lines = line, lines
+        asked = f"axis {name} on {config.port} axis {config.axis}"
+        firmware = line.ask("?:V", _VERSION)
+        if config.firmware not in (None, firmware):
+            raise WrongDevice(asked, f"its firmware is {firmware}", "Correct `port` or `firmware` in the rig file")
+        count = len(self._status().pulses)
+        if config.axis > count:
+            raise WrongDevice(asked, f"the controller has {count} axes", "Correct `axis` in the rig file")
+        self.counts_per_deg = config.pulses_per_deg
+        self.speed_deg_s = config.speed_pps / config.pulses_per_deg
+        self.acceleration_deg_s2 = self.speed_deg_s / config.acceleration_s
+        self._home_speed_deg_s = HOMING_PPS / config.pulses_per_deg
+        self._identity = AxisIdentity(
+            kind=config.kind,
+            model=f"SHOT controller of {count} axes",
+            serial_number="not told by the protocol",
+            firmware=firmware,
+            port=config.port,
+            address=str(config.axis),
+        )
+
+    def describe(self) -> AxisIdentity:
+        return self._identity
+
+    def _status(self) -> ShotStatus:
+        *pulses, taken, at_limit, busy = self._line.ask("Q:", _STATUS).replace(" ", "").split(",")
+        return ShotStatus([int(text) for text in pulses], taken == "K", at_limit, busy == "B")
+
+    def _command(self, *commands: str) -> None:
+        """Send commands and ask after each whether it was taken; some controllers also answer OK or NG."""
+        for command in commands:
+            with self._line.link.lock:
+                self._line.send(command)
+                taken = self._status().taken
+            if not taken:
+                self._give_up_homing()
+                raise CommandRejected(
+                    f"axis {self.name}, {command}", "the controller refuses it", "Is the motor free, or at a limit?"
+                )
+
+    def _do_read_counts(self) -> int:
+        return self._status().pulses[self.config.axis - 1]
+
+    def _do_is_moving(self) -> bool:
+        # One garbled letter must not end a motion.
+        busy = [self._status().busy for _ in range(2)]
+        self._saw_motion = self._saw_motion or all(busy)
+        return any(busy)
+
+    def _homing_is_proved(self, counts: float, tolerance: float) -> bool:
+        # The controller took H; a short way home may be over before the first look.
+        return self._saw_motion or abs(counts) <= tolerance
+
+    def _do_start_move(self, counts: float) -> None:
+        way = round(counts) - int(self._read_confirmed()[0])
+        self._begin_moving()
+        if way:
+            self._command(f"M:{self.config.axis}{'+' if way > 0 else '-'}P{abs(way)}", "G:")
+
+    def _do_start_home(self) -> None:
+        self._begin_homing()
+        self._command(f"H:{self.config.axis}{self.config.home_direction or ''}")
+
+    def _do_stop(self) -> None:
+        # While it looks for the origin, a GSC-02 obeys only what is meant for all axes.
+        whom = "W" if self._homing and self.config.home_direction else self.config.axis
+        self._give_up_homing()
+        self._line.send(f"L:{whom}")
+
+    def _do_check_fault(self) -> None:
+        """The controller tells no faults."""
+
+    def _do_warnings(self) -> list[str]:
+        words = self._reference_warnings()
+        if self.config.axis in _AT_LIMIT.get(self._status().at_limit, ()):
+            words.append("stopped at a limit switch")
+        return words
+
+    def _do_close(self) -> None:
+        self._lines.release(self.config.port)
+
+
+class GSCLine(TextLine):
+    """The port of one controller, for one axis."""
+
+    axis = 0
+
+    def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
+        link = SerialLink(
+            config.port,
+            config.baudrate,
+            line_framer,
+            rtscts=config.rtscts,
+            transcript=transcript,
+            clock=clock,
+            held_by=config.held_by,
+        )
+        check = "Check power, cable, baud rate and RTS/CTS"
+        super().__init__(link, "SHOT controller", config.reply_s or 1.0, end="\r\n", what_to_check=check)
+
+
+def open(name: str, config: Config, lines: LineRegistry) -> GSCAxis:
+    """Open the axis; asks for firmware and status and moves nothing."""
+    make = partial(GSCLine, config, lines.clock)
+    with lines.taken(config.port, GSCLine, make) as line:
+        if line.axis not in (0, config.axis):
+            raise WrongDevice(
+                f"axis {name} on {config.port} axis {config.axis}",
+                f"axis {line.axis} of this controller is in use, and it moves one at a time",
+                "Give each axis a controller of its own",
+            )
+        line.axis = config.axis
+        return GSCAxis(name, config, line, lines)

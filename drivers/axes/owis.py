@@ -1,0 +1,170 @@
+"""OWIS position control units of the PS family (PS10, PS35, PS90) with rotation stages.
+
+Facts: the public EPICS driver motorOWISPS (table of commands, letters of the states, homing modes, lines that end in
+CR), and public programs for a PS90 over its serial line. States are one letter for each axis (``?ASTAT``). The unit
+does not tell whether an axis is homed; speed and limits are read in units that are not documented there, so the rig
+file says the speed. Unverified on hardware: everything.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from drivers.clock import Clock
+from drivers.errors import CommandRejected, ReplyError, WrongDevice
+from drivers.motion import AxisIdentity
+from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
+from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
+from drivers.text_line import TextLine
+
+READY = "R"
+# Positioning or turning at a speed, with or without a curve and microsteps; reference, release of a switch, phase.
+MOVING = frozenset("TSVWXYCPFJNH")
+NOT_READY = {"I": "initialized, not ready", "O": "disabled", "U": "not released"}
+FAULTS = {
+    "L": "disabled at a limit switch",
+    "B": "stopped at a brake switch",
+    "A": "disabled after an error of the limit switches",
+    "M": "disabled after an error of the motion controller",
+    "Z": "disabled after a timeout",
+    "E": "disabled after a motion error",
+}
+STATES = READY + "".join(sorted(MOVING)) + "".join(NOT_READY) + "".join(FAULTS)
+INITIALIZED_S = 5.0
+_COUNT = re.compile(r"-?\d{1,10}")
+_STATES = re.compile(rf"[{STATES}?]{{1,9}}")
+# Not a message, which starts with its number.
+_VERSION = re.compile(r"(?!\d\d )(?=.*\d)[A-Za-z].*")
+
+
+class Config(SessionReferenceConfig):
+    """An axis of an OWIS unit in a rig file."""
+
+    identified_by: ClassVar[str] = "version"
+
+    kind: Literal["owis"] = "owis"
+    axis: int = Field(default=1, ge=1, le=9, description="number of the axis at its unit")
+    version: str | None = Field(default=None, description="what the unit answers to ?VERSION")
+    counts_per_deg: float = Field(gt=0, description="what the unit counts in a degree: (micro)steps or encoder")
+    speed_deg_s: float = Field(gt=0, description="speed of moves as the unit is set, for deadlines")
+    acceleration_deg_s2: float = Field(default=100.0, gt=0, description="acceleration as the unit is set")
+    home_mode: int = Field(default=4, ge=0, le=7, description="mode of REF; 4: to the reference switch, which is zero")
+    baudrate: int = Field(default=9600, description="bits a second, as the unit is set")
+
+    def place(self) -> str:
+        return f"axis {self.axis}"
+
+
+class OWISAxis(SessionReferenceAxis):
+    """One axis of a unit."""
+
+    def __init__(self, name: str, config: Config, line: TextLine, lines: LineRegistry) -> None:
+        super().__init__(name, config, lines.clock)
+        self.config: Config = config
+        self._line, self._lines = line, lines
+        asked = f"axis {name} on {config.port} axis {config.axis}"
+        version = line.ask("?VERSION", _VERSION)
+        if config.version not in (None, version):
+            raise WrongDevice(asked, f"{version} answers", "Correct `port` or `version` in the rig file")
+        count = agreed(lambda: len(line.ask("?ASTAT", _STATES)))
+        if config.axis > count:
+            raise WrongDevice(asked, f"the unit has {count} axes", "Correct `axis` in the rig file")
+        self.counts_per_deg = config.counts_per_deg
+        self.speed_deg_s, self.acceleration_deg_s2 = config.speed_deg_s, config.acceleration_deg_s2
+        self._identity = AxisIdentity(
+            kind=config.kind,
+            model=f"OWIS PS of {count} axes",
+            serial_number="not asked for",
+            firmware=version,
+            port=config.port,
+            address=str(config.axis),
+        )
+
+    def describe(self) -> AxisIdentity:
+        return self._identity
+
+    def _state(self) -> str:
+        for _ in range(2):
+            states = self._line.ask("?ASTAT", _STATES)
+            if len(states) >= self.config.axis and states[self.config.axis - 1] != "?":
+                return states[self.config.axis - 1]
+        raise ReplyError(f"axis {self.name}, state", f"unknown in {states!r}", "Check the cable; switch the unit off")
+
+    def _send(self, command: str) -> None:
+        self._line.send(command)
+
+    def _make_ready(self) -> None:
+        """Initialize an axis that is not ready, which switches its motor on, and wait until it is."""
+        axis = self.config.axis
+        if self._state() == READY and self._state() == READY:
+            return
+        self._send(f"INIT{axis}")
+        give_up_s = self.clock.now_s() + INITIALIZED_S
+        while (state := self._state()) != READY:
+            if self.clock.now_s() > give_up_s:
+                words = FAULTS.get(state) or NOT_READY.get(state) or f"state {state}"
+                raise CommandRejected(f"axis {self.name}, INIT{axis}", words, "Look at the stage and its switches")
+            self.clock.sleep_s(0.02)
+
+    def _do_read_counts(self) -> int:
+        return int(self._line.ask(f"?CNT{self.config.axis}", _COUNT))
+
+    def _do_is_moving(self) -> bool:
+        # One garbled letter must not end a motion.
+        states = [self._state() for _ in range(2)]
+        self._saw_motion = self._saw_motion or states == ["P", "P"]
+        return any(state in MOVING for state in states)
+
+    def _homing_is_proved(self, counts: float, tolerance: float) -> bool:
+        # A short way home may be over before the first look; its end is zero.
+        return self._saw_motion or abs(counts) <= tolerance
+
+    def _do_start_move(self, counts: float) -> None:
+        self._make_ready()
+        self._begin_moving()
+        axis = self.config.axis
+        with self._line.link.lock:
+            for command in (f"ABSOL{axis}", f"PSET{axis}={round(counts)}", f"PGO{axis}"):
+                self._send(command)
+
+    def _do_start_home(self) -> None:
+        self._make_ready()
+        self._begin_homing()
+        self._send(f"REF{self.config.axis}={self.config.home_mode}")
+
+    def _do_stop(self) -> None:
+        self._give_up_homing()
+        self._send(f"STOP{self.config.axis}")
+
+    def _do_check_fault(self) -> None:
+        state = self._state()
+        if state in FAULTS and self._state() == state:
+            self._give_up_homing()
+            raise CommandRejected(f"axis {self.name}, state", FAULTS[state], "Free the stage; a move initializes it")
+
+    def _do_warnings(self) -> list[str]:
+        words = self._reference_warnings()
+        if (state := self._state()) in NOT_READY:
+            words.append(NOT_READY[state])
+        return words
+
+    def _do_close(self) -> None:
+        self._lines.release(self.config.port)
+
+
+def _line(config: Config, clock: Clock, transcript: Transcript | None) -> TextLine:
+    link = SerialLink(
+        config.port, config.baudrate, line_framer, transcript=transcript, clock=clock, held_by=config.held_by
+    )
+    check = "Check power, cable and baud rate"
+    return TextLine(link, "OWIS PS", config.reply_s or 1.0, end="\r", what_to_check=check)
+
+
+def open(name: str, config: Config, lines: LineRegistry) -> OWISAxis:
+    """Open one axis; asks for version and states and moves nothing."""
+    with lines.taken(config.port, TextLine, partial(_line, config, lines.clock)) as line:
+        return OWISAxis(name, config, line, lines)
