@@ -1,5 +1,5 @@
-"""Text protocol of Thorlabs' small boxes: a command ends in CR; the box echoes it, answers in lines that end in CR, and
-then sends the prompt ">", which the SC10 and the FW102C follow with a blank."""
+"""Text protocol of Thorlabs' small boxes: a command ends in CR; most boxes echo it; all answer in lines that end in CR,
+and then send the prompt ">", which the SC10 and the FW102C follow with a blank."""
 
 from __future__ import annotations
 
@@ -29,25 +29,27 @@ class PromptLine:
     link : open, with `prompt_framer`.
     name : of the device, for messages.
     reply_s : longest wait for an answer.
+    echo : whether the box repeats a command before it answers.
     """
 
-    def __init__(self, link: SerialLink, name: str, reply_s: float) -> None:
+    def __init__(self, link: SerialLink, name: str, reply_s: float, *, echo: bool = True) -> None:
         self._link = link
         self._name = name
         self._reply_s = reply_s
+        self._echo = echo
 
-    def ask(self, query: str) -> str:
-        """One query; an unusable reply is asked for once more, after the line has been quiet.
+    def ask(self, query: str, form: re.Pattern[str] | None = None) -> str:
+        """One query; an unusable reply, also one of another form, is asked for once more after a pause.
 
         Raises
         ------
         CommandRejected, ReplyError, ReplyTimeout
         """
         try:
-            return self._exchange(query, self._reply_s)
+            return self._exchange(query, self._reply_s, form)
         except (ReplyError, ReplyTimeout):
             self._link.purge()
-            return self._exchange(query, self._reply_s)
+            return self._exchange(query, self._reply_s, form)
 
     def tell(self, command: str, reply_s: float | None = None) -> None:
         """One command, sent once: whether it worked is read from the state afterwards. Raises CommandRejected."""
@@ -67,7 +69,7 @@ class PromptLine:
             )
         return int(answer)
 
-    def _exchange(self, text: str, reply_s: float) -> str:
+    def _exchange(self, text: str, reply_s: float, form: re.Pattern[str] | None = None) -> str:
         asked = f"{self._name}, {text}"
         with self._link.lock:
             self._link.write(text.encode("ascii") + b"\r")
@@ -77,9 +79,12 @@ class PromptLine:
         # The blank behind the prompt of the answer before stands at the front.
         # Terminal servers turn the CR of the box into LF, or into both.
         lines = re.split(r"[\r\n]+", frame.decode("ascii", "replace").lstrip(" \r\n"))
-        if lines[0] != text:
-            raise ReplyError(asked, f"the echo is {lines[0]!r}", "The line is disturbed: check cable and baud rate")
-        answer = " ".join(line for line in lines[1:] if line)
-        if "error" in answer.lower():
+        check = "The line is disturbed: check cable and baud rate"
+        if self._echo and lines.pop(0) != text:
+            raise ReplyError(asked, f"the echo of {text!r} is missing in {frame!r}", check)
+        answer = " ".join(line for line in lines if line)
+        if "error" in answer.lower() or answer.startswith("CMD_"):
             raise CommandRejected(asked, answer, "Check the device's model and firmware")
+        if form is not None and not form.fullmatch(answer):
+            raise ReplyError(asked, f"{answer!r} is no answer to it", check)
         return answer

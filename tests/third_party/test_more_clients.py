@@ -8,9 +8,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import serial
 from served_emulator import served, wait_until
 
 pytestmark = [pytest.mark.third_party, pytest.mark.filterwarnings("ignore")]
@@ -97,6 +99,43 @@ def test_tl_elliptec() -> None:
         mount.home()
         assert mount.move_absolute(60.0) == pytest.approx(60.0, abs=0.01)
         assert emulator.true_deg(0) == pytest.approx(60.0, abs=0.01)
+
+
+def test_elliptec_motorized_stages() -> None:
+    bus_of = pytest.importorskip("ElliptecBus")
+    stages = pytest.importorskip("ElliptecRotaryStages.ELL14")
+    with served("elliptec") as (emulator, path), bus_of.ElliptecBus(path) as bus:
+        assert bus.scan_addresses() == ["0", "1"]
+        mounts = [stages.Ell14(bus, address) for address in ("0", "1")]
+        for mount in mounts:
+            mount.home()
+        assert mounts[0].move_absolute_degrees(45.0) == pytest.approx(45.0, abs=0.01)
+        assert mounts[1].move_relative_degrees(-30.0) == pytest.approx(-30.0, abs=0.01)
+        assert (emulator.true_deg(0), emulator.true_deg(1)) == pytest.approx((45.0, -30.0), abs=0.01)
+        mounts[0].set_velocity_percent(60)
+        assert mounts[0].get_velocity_percent() == 60
+
+
+def test_thorlabs_apt_protocol() -> None:
+    protocol = pytest.importorskip("thorlabs_apt_protocol")
+    with served("apt-k10cr2", homed=True) as (emulator, path), serial.Serial(path, 115200, timeout=0.05) as port:
+        messages = protocol.Unpacker(port)
+
+        def answer(name: str) -> Any:
+            give_up_s = time.monotonic() + 8
+            while time.monotonic() < give_up_s:
+                for message in messages:
+                    if message.msg == name:
+                        return message
+            return pytest.fail(f"no {name}")
+
+        port.write(protocol.hw_req_info(dest=0x50, source=1))
+        assert answer("hw_get_info").model_number == b"K10CR2\0\0"
+        port.write(protocol.mot_move_absolute(dest=0x50, source=1, chan_ident=1, position=1_365_333))
+        answer("mot_move_completed")
+        assert emulator.true_deg(0) == pytest.approx(10.0, abs=1e-4)
+        port.write(protocol.mot_req_poscounter(dest=0x50, source=1, chan_ident=1))
+        assert answer("mot_get_poscounter").position == 1_365_333
 
 
 @contextmanager
@@ -251,3 +290,16 @@ def test_pyoptosigma() -> None:
             wait_until("rest", lambda: not session.is_busy())
         finally:
             session.port.close()
+
+
+def test_plico_motor_server() -> None:
+    filters = pytest.importorskip("plico_motor_server.devices.KURIOSVB1_thorlabs")
+    with served("kurios") as (emulator, path):
+        head = filters.TunableFilter("filter", SimpleNamespace(port_name=lambda: path), 115_200)
+        assert "KURIOS-VB1" in head.connect()
+        try:
+            head.move_to(1, 662)
+            assert emulator.values["WL"] == 662.0
+            assert "TP=31.200" in head.get_temperature()
+        finally:
+            head.disconnect()

@@ -56,6 +56,46 @@ def test_pylablib_elliptec() -> None:
             motor.close()
 
 
+def test_pylablib_standa() -> None:
+    from pylablib.devices import Standa
+
+    with served("standa") as (emulator, path):
+        stage = Standa.Standa8SMC(path)
+        try:
+            assert stage.get_engine_type().engine == "step"
+            stage.home()
+            assert stage.set_position_reference(0) == 0
+            # In microsteps, of which a step has 256 and a degree 100 steps.
+            stage.move_to(256_000)
+            stage.wait_move()
+            stage.move_by(-128_000)
+            stage.wait_move()
+            assert stage.get_position() == 128_000
+            assert emulator.true_deg(0) == pytest.approx(5.0)
+            stage.jog("+")
+            wait_until("jog", lambda: emulator.true_deg(0) > 6.0)
+            stage.stop()
+            stage.wait_move()
+            stage.setup_power(hold_current=33)
+            assert stage.get_power_parameters().hold_current == 33
+        finally:
+            stage.close()
+
+
+def test_pylablib_filter_wheel() -> None:
+    from pylablib.devices import Thorlabs
+
+    with served("fw102c") as (emulator, path):
+        wheel = Thorlabs.FW(path)
+        try:
+            assert (wheel.get_pcount(), wheel.get_position()) == (6, 6)
+            wheel.set_position(3)
+            wait_until("filter", lambda: emulator.light_at(662.0) == 1.0)
+            assert wheel.get_position() == 3
+        finally:
+            wheel.close()
+
+
 @pytest.mark.parametrize(
     ("kind", "scale"),
     [
@@ -113,13 +153,11 @@ def test_thorlabs_apt_device() -> None:
             time.sleep(0.3)
 
 
-@pytest.mark.parametrize(("kind", "name"), [("apt-bsc203", "BSC"), ("apt-bbd203", "BBD203")])
-def test_thorlabs_apt_device_and_the_bays_of_a_rack(kind: str, name: str) -> None:
-    from thorlabs_apt_device.devices import bbd, bsc
+def test_thorlabs_apt_device_and_the_bays_of_a_rack() -> None:
+    from thorlabs_apt_device.devices.bsc import BSC
 
-    with served(kind, speed=4.0, axes=3) as (emulator, path):
-        more = {"x": 3} if name == "BSC" else {}
-        rack = getattr(bsc if name == "BSC" else bbd, name)(serial_port=path, home=False, **more)
+    with served("apt-bsc203", speed=4.0, axes=3) as (emulator, path):
+        rack = BSC(serial_port=path, home=False, x=3)
         try:
             for bay in (1, 2):
                 status = rack.status_[bay][0]

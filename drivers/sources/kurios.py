@@ -1,0 +1,155 @@
+"""Thorlabs KURIOS tunable filters: any wavelength of their range, in a band that a rig file chooses, before a lamp.
+
+115200 8N1, commands that end in CR, answers ``WL=550.000`` and the prompt ``>`` without an echo. A KURIOS-VB1 blocks
+light in the band BLACK; other heads make dark with a shutter.
+
+Sources: user guide of the KURIOS-VB1, rev. G of 2019, pages 17 to 22 (baud rate, prompt, CMD_NOT_DEFINED, ``*idn?``,
+``SP?``, ``OH?``, bands); the public driver of plico_motor_server (``WL``, ``ST?``). Unverified: everything on hardware;
+the number of ``OM=1`` (manual), which is that of a public program.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from functools import partial
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from drivers.clock import Clock
+from drivers.errors import DeviceError, WrongDevice
+from drivers.prompt_line import PromptLine, prompt_framer
+from drivers.serial_link import LineRegistry, SerialLink, Transcript
+from drivers.source import LightSource
+from drivers.sources import sc10
+
+BAUDRATE = 115200
+BLACK = 1
+BANDS = {"wide": 2, "medium": 4, "narrow": 8}
+READY, MANUAL = 2, 1
+# A filter shows what it was told to three digits.
+_SAME_NM = 0.01
+_NUMBER = r"-?\d+(?:\.\d+)?"
+
+
+class Config(BaseModel):
+    """KURIOS in a rig file; light is shut off by the band BLACK, or by a shutter beside the filter."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["kurios"] = "kurios"
+    port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
+    held_by: str | None = Field(default=None, description="program that may hold the port too: its simulator")
+    band: Literal["wide", "medium", "narrow"] = Field(default="wide", description="bandwidth mode")
+    shutter: sc10.Config | None = Field(default=None, description="SC10 shutter, where the filter has no band BLACK")
+    reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
+    settle_s: float = Field(default=0.3, ge=0, description="time that the liquid crystals take after a change")
+
+
+class TunableFilter(LightSource):
+    """A filter between lamp and sample."""
+
+    selects_wavelength = True
+
+    def __init__(self, config: Config, link: SerialLink, shutter: LightSource | None, lines: LineRegistry) -> None:
+        self.config = config
+        self._link, self._lines = link, lines
+        self._shutter = shutter
+        self._name = f"tunable filter on {config.port}"
+        self._line = PromptLine(link, self._name, config.reply_s, echo=False)
+        self._model = self._line.ask("*idn?")
+        if "KURIOS" not in self._model.upper():
+            raise WrongDevice(
+                f"identify the {self._name}",
+                f"it answers {self._model!r}, which is no KURIOS",
+                "Correct `source` in the rig file",
+            )
+        bands = int(self._value("OH")) & 0xFF
+        if not bands & BANDS[config.band]:
+            raise WrongDevice(f"{self._name}, band {config.band}", "it has none", "Correct `band` in the rig file")
+        if shutter is None and not bands & BLACK:
+            raise WrongDevice(f"{self._name}, dark", "it has no band BLACK", "Add a `shutter` to the rig file")
+        limits = re.compile(rf"WLmax=({_NUMBER}) WLmin=({_NUMBER})")
+        found = limits.fullmatch(self._line.ask("SP?", limits))
+        self._range_nm = (float(found[2]), float(found[1])) if found else (0.0, 0.0)
+
+    def _value(self, keyword: str) -> float:
+        form = re.compile(rf"{keyword}=({_NUMBER})")
+        return float(self._line.ask(f"{keyword}?", form).partition("=")[2])
+
+    def _set(self, keyword: str, value: float) -> None:
+        """Set a value where it is another one, wait for the liquid crystals, and read it back."""
+        if abs(self._value(keyword) - value) <= _SAME_NM:
+            return
+        self._line.tell(f"{keyword}={value:g}")
+        self._link.clock.sleep_s(self.config.settle_s)
+        back = self._value(keyword)
+        if abs(back - value) > _SAME_NM:
+            raise DeviceError(f"{self._name}, {keyword}={value:g}", f"it reads back {back:g}", "Is it in manual mode?")
+
+    def _require_ready(self) -> None:
+        if self._value("ST") != READY:
+            raise DeviceError(f"{self._name}, state", "it warms up", "Wait until its display shows a wavelength")
+
+    def select(self, wavelength_nm: float) -> None:
+        """Tune to a wavelength of the filter's range; a filter that is black stays so."""
+        low, high = self._range_nm
+        if not low <= wavelength_nm <= high:
+            raise DeviceError(
+                f"{self._name}, select {wavelength_nm:g} nm", f"its range is {low:g} to {high:g} nm", "Correct the plan"
+            )
+        self._require_ready()
+        self._set("OM", MANUAL)
+        self._set("WL", wavelength_nm)
+
+    def set_light(self, on: bool) -> None:
+        """Open or close the shutter, or change between the band of the rig file and BLACK."""
+        self._require_ready()
+        if self._shutter is None:
+            self._set("BW", BANDS[self.config.band] if on else BLACK)
+            return
+        if on:
+            self._set("BW", BANDS[self.config.band])
+        self._shutter.set_light(on)
+
+    def is_on(self) -> bool:
+        """True if the shutter is open, or the band is not BLACK."""
+        open_ = self._shutter is None or self._shutter.is_on()
+        return open_ and self._value("BW") != BLACK
+
+    def interlock_open(self) -> bool:
+        """That of the shutter; a filter alone has none."""
+        return self._shutter is not None and self._shutter.interlock_open()
+
+    def describe(self) -> dict[str, str]:
+        """Kind, model, port and band."""
+        found = {"kind": self.config.kind, "model": self._model, "port": self.config.port, "band": self.config.band}
+        if self._shutter is not None:
+            found["shutter"] = self._shutter.describe()["model"]
+        return found
+
+    def close(self) -> None:
+        """Give the ports back; filter and shutter stay as they are."""
+        if self._shutter is not None:
+            self._shutter.close()
+        self._lines.release(self.config.port)
+
+
+def open(config: Config, lines: LineRegistry) -> TunableFilter:
+    """Open the filter, and the shutter where there is one; asks who they are and changes nothing."""
+    with (
+        lines.taken(config.port, SerialLink, partial(_link, config, lines.clock)) as link,
+        contextlib.ExitStack() as failed,
+    ):
+        shutter: LightSource | None = None
+        if config.shutter is not None:
+            shutter = sc10.open(config.shutter, lines)
+            failed.callback(shutter.close)
+        source = TunableFilter(config, link, shutter, lines)
+        failed.pop_all()
+        return source
+
+
+def _link(config: Config, clock: Clock, transcript: Transcript | None) -> SerialLink:
+    return SerialLink(config.port, BAUDRATE, prompt_framer, transcript=transcript, clock=clock, held_by=config.held_by)
