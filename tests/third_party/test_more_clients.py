@@ -303,3 +303,38 @@ def test_plico_motor_server() -> None:
             assert "TP=31.200" in head.get_temperature()
         finally:
             head.disconnect()
+
+
+def test_pymodaq_smc100() -> None:
+    package = pytest.importorskip("pymodaq_plugins_newport.hardware.smc100")
+    with served("smc100") as (emulator, path):
+        arm = package.SMC100(path)
+        try:
+            assert (arm.idn, arm.error_and_controller_status()) == ("URS150CC", ("0000", "0A"))
+            arm.homing()
+            wait_until("homed", lambda: emulator.axes[0].homed)
+            arm.move_abs(30)
+            arm.wait_move_finish(0.05)
+            arm.move_rel(-5)
+            arm.wait_move_finish(0.05)
+            assert (arm.position, emulator.true_deg(0)) == (25.0, 25.0)
+            arm.speed = 100
+            assert (arm.speed, arm.get_last_command_error()) == (100.0, "@")
+        finally:
+            arm.close()
+
+
+def test_instrumentkit_esp301() -> None:
+    package = pytest.importorskip("instruments")
+    with served("esp301") as (emulator, path):
+        box = package.newport.NewportESP301.open_serial(path, 19_200, timeout=1)
+        axis = box.axis[0]
+        axis.enable()
+        axis.search_for_home()
+        wait_until("homed", lambda: axis.is_motion_done)
+        axis.move(20, absolute=True)
+        wait_until("target", lambda: axis.is_motion_done)
+        axis.move(-5, absolute=False)
+        wait_until("target", lambda: axis.is_motion_done)
+        assert float(axis.position) == emulator.true_deg(0) == 15.0
+        assert float(axis.right_limit) == 180.0
