@@ -191,8 +191,8 @@ def served(work: Path, *, cutoff: bool) -> Iterator[tuple[SimulatedRig, Path]]:
             yield simulation, work / "served.yaml"
 
 
-def once(number: int, faults: list[str], gap_s: float, discs: Discs, *, cutoff: bool) -> dict[str, object]:
-    """One run; what became of the light, and whether it was reported."""
+def once(number: int, faults: list[str], gap_s: float, discs: Discs, *, cutoff: bool) -> dict[str, object] | None:
+    """One run; what became of the light, and whether it was reported. None where there was no light to shut."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name, contextlib.ExitStack() as stack:
         work = Path(name)
         simulation, rig = stack.enter_context(served(work, cutoff=cutoff))
@@ -211,7 +211,9 @@ def once(number: int, faults: list[str], gap_s: float, discs: Discs, *, cutoff: 
             return {"dark_s": 99.0 if lit else 0.0, "reported": "guard" in said}
         while not simulation.light():
             if run.child.poll() is not None:
-                raise SystemExit(f"acquire ended before there was light: {run.errors.read_text()[-400:]}")
+                print(f"ended before there was light: {run.errors.read_text()[-300:]}", file=sys.stderr)
+                shutil.rmtree(out, ignore_errors=True)
+                return None
             time.sleep(0.005)
         time.sleep(random.uniform(0, 0.5))
         while not simulation.light() and run.child.poll() is None:
@@ -265,7 +267,11 @@ def main() -> None:
                 gap_s, cutoff = chance.uniform(0, 3), chance.random() < 0.3
                 gone = {fault.split()[0] for fault in faults}
                 doomed = gone == {"acquire", "guard"} and gap_s < TOO_CLOSE_S and not cutoff
-                found = once(number, faults, gap_s, discs, cutoff=cutoff)
+                for _ in range(3):
+                    if (found := once(number, faults, gap_s, discs, cutoff=cutoff)) is not None:
+                        break
+                else:
+                    raise SystemExit("three runs in a row ended before there was light")
                 kind = "25 disc" if "disc" in gone else "26 guard" if "guard" in gone else "17 acquire"
                 hardware = "relay" if cutoff else "both at once" if doomed else "none"
                 found |= {"faults": faults, "gap_s": round(gap_s, 2), "hardware": hardware, "number": number}
