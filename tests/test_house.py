@@ -34,6 +34,20 @@ def imports(root: Path) -> dict[str, set[str]]:
     return found
 
 
+#: A kit asks these names of each module of a kind.
+OF_EACH_KIND = {"Config", "Constants", "Model"}
+
+
+def test_one_class_name_is_one_class():
+    found: dict[str, list[str]] = {}
+    for package in PACKAGES:
+        for file in (ROOT / package).rglob("*.py"):
+            for node in ast.parse(file.read_text(encoding="utf-8")).body:
+                if isinstance(node, ast.ClassDef) and node.name not in OF_EACH_KIND:
+                    found.setdefault(node.name, []).append(str(file.relative_to(ROOT)))
+    assert {name: files for name, files in found.items() if len(files) > 1} == {}
+
+
 def test_no_circle_of_imports():
     try:
         TopologicalSorter(imports(ROOT)).prepare()

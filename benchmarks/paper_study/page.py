@@ -18,7 +18,7 @@ from processing.campaign.run import PAPER, CampaignResult
 from processing.reflectance.base import load_reflectance
 from processing.reflectance.tables import ScatteringTable
 from processing.reports.figure_style import png
-from processing.reports.template import Figure, Section, render
+from processing.reports.template import Figure, ReportSection, render
 from processing.storage.products.product import Product
 
 LABELS = {"psi_deg": "psi / degrees", "magnitude_percent": "|D| / %", "xi0_percent": "xi0 / %"}
@@ -73,11 +73,11 @@ def write_page(
 
 def _section(
     title: str, shown: Sequence[Shown], tables: Sequence[Table] = (), summary: Sequence[tuple[str, str]] = ()
-) -> Section:
-    return Section(title, summary, [Figure(png(s.figure), s.caption) for s in shown], tables)
+) -> ReportSection:
+    return ReportSection(title, summary, [Figure(png(s.figure), s.caption) for s in shown], tables)
 
 
-def _numbers(size: Size, sphere: SphereStudy, wavelengths: Sequence[float], seconds: dict[str, float]) -> Section:
+def _numbers(size: Size, sphere: SphereStudy, wavelengths: Sequence[float], seconds: dict[str, float]) -> ReportSection:
     head = ["", *(f"{nm:g} nm, {who}" for nm in wavelengths for who in ("paper", "here", "here, noise alone"))]
     rows = [head]
     for name in QUANTITIES:
@@ -119,7 +119,7 @@ def _numbers(size: Size, sphere: SphereStudy, wavelengths: Sequence[float], seco
         ),
         ("time", ", ".join(f"{name} {value:.0f} s" for name, value in seconds.items())),
     ]
-    return Section("The paper's numbers and ours", summary, (), [("Mean deviations", rows)])
+    return ReportSection("The paper's numbers and ours", summary, (), [("Mean deviations", rows)])
 
 
 def _rows(result: CampaignResult) -> Table:
@@ -132,7 +132,7 @@ def _rows(result: CampaignResult) -> Table:
     return "Every angle", [head, *body]
 
 
-def _tables(sphere: SphereStudy, wavelengths: Sequence[float], pixels: int) -> Section:
+def _tables(sphere: SphereStudy, wavelengths: Sequence[float], pixels: int) -> ReportSection:
     rows = [["", "bins filled of 91 x 91 x 361", "samples"]]
     for (kind, nm), path in sphere.as_told.tables.items():
         table = ScatteringTable.load(path)
@@ -142,7 +142,7 @@ def _tables(sphere: SphereStudy, wavelengths: Sequence[float], pixels: int) -> S
     return _section("xi0 through look-up tables", shown, [("The tables", rows)])
 
 
-def _materials(sphere: SphereStudy, wavelengths: Sequence[float]) -> Section:
+def _materials(sphere: SphereStudy, wavelengths: Sequence[float]) -> ReportSection:
     told, true = load_reflectance(TABLE_I), load_reflectance(TRUE_MATERIAL)
     rows = [["", "n", "k", "a", "b", "reduced chi-square", "pixels"]]
     for nm in wavelengths:
@@ -162,10 +162,10 @@ def _materials(sphere: SphereStudy, wavelengths: Sequence[float]) -> Section:
         "differ for another dominant process. Errors hold noise and misfit. A constant that is not determined has an "
         "error above 30 % of it, or is at a bound of the search: one angle and few pixels (--quick) cannot do better"
     )
-    return Section("Constants of the material, both ways", [("how", note)], (), [("n + ik, a, b", rows)])
+    return ReportSection("Constants of the material, both ways", [("how", note)], (), [("n + ik, a, b", rows)])
 
 
-def _budget(sphere: SphereStudy, wavelengths: Sequence[float]) -> Section:
+def _budget(sphere: SphereStudy, wavelengths: Sequence[float]) -> ReportSection:
     head = ["", "in all", "noise", "registration", "constants", "rest"]
     rows = [head]
     for nm in wavelengths:
@@ -179,10 +179,10 @@ def _budget(sphere: SphereStudy, wavelengths: Sequence[float]) -> Section:
         "the bench's own material takes the place of Table I, which only a simulation can do. Rest: what then is left "
         "above the noise; for xi0 a scene that is not triply degenerate. A minus sign: the deviation grew"
     )
-    return Section("What the paper could not separate", [("how to read it", note)], (), [("Budget", rows)])
+    return ReportSection("What the paper could not separate", [("how to read it", note)], (), [("Budget", rows)])
 
 
-def _fault(fault: FaultStudy, wavelengths: Sequence[float]) -> Section:
+def _fault(fault: FaultStudy, wavelengths: Sequence[float]) -> ReportSection:
     found = []
     for effect in fault.found.effects:
         values = ", ".join(f"{name} {value.told} {value.unit}" for name, value in effect.parameters.items())

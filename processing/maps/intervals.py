@@ -79,7 +79,7 @@ def has_own_95(name: str) -> bool:
     return name in OWN_95 or (scalar is not None and bool(scalar.elements))
 
 
-class Noise(Protocol):
+class ElementNoise(Protocol):
     """What an image knows of the errors of its elements."""
 
     def variance_of(self, gradient: NDArray[np.floating]) -> Array: ...
@@ -88,7 +88,7 @@ class Noise(Protocol):
 
 
 def set_magnitudes(
-    planes: Planes, derived: Mapping[str, Derived], m: Array, image: Noise, *, widened: Array | float = 1.0
+    planes: Planes, derived: Mapping[str, Derived], m: Array, image: ElementNoise, *, widened: Array | float = 1.0
 ) -> None:
     """Replace value and error of every length of a vector, and add its 95 % interval.
 
@@ -107,7 +107,7 @@ def set_magnitudes(
         _put(planes, name, *interval(np.asarray(quantity.value, dtype=float), along, total, square))
 
 
-def _moments(quantity: Derived, m: Array, image: Noise) -> tuple[Array, Array]:
+def _moments(quantity: Derived, m: Array, image: ElementNoise) -> tuple[Array, Array]:
     """tr C and tr C^2 of the vector whose length a quantity is."""
     if quantity.parts is None:
         vector = m.reshape(*m.shape[:-2], 16)[..., quantity.elements]
@@ -145,7 +145,7 @@ def set_ellipticity(planes: Planes) -> None:
     if name not in planes:
         return
     linear, circular = planes["polarizance_linear"].astype(float), planes["polarizance_circular"].astype(float)
-    # Noise is taken off the linear part: else circular light has less ellipticity than 45 degrees.
+    # ElementNoise is taken off the linear part: else circular light has less ellipticity than 45 degrees.
     value = np.rad2deg(0.5 * np.arctan2(circular, linear))
     halves = directions(np.deg2rad(2 * planes[f"{name}_errors"].astype(float)))
     half_68, half_95 = (np.rad2deg(half) / 2 for half in halves)

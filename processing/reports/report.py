@@ -25,7 +25,7 @@ from processing.reports.figure_style import map_figure, png, thin
 from processing.reports.figures import product_figure
 from processing.reports.mueller_maps import mueller_maps
 from processing.reports.tables import table_section
-from processing.reports.template import Figure, Section, render
+from processing.reports.template import Figure, ReportSection, render
 from processing.storage.captures.capture import Capture, CaptureError
 from processing.storage.integrity.h5_door import DAMAGE, open_h5
 from processing.storage.products.product import Product, is_product
@@ -98,7 +98,7 @@ def write_report(
     require_place(out, overwrite)
     files = [f for f in collect(sources) if os.path.realpath(f) != os.path.realpath(out)]
     simulated = _kind_of_data(files)
-    sections: list[Section] = []
+    sections: list[ReportSection] = []
     for count, file in enumerate(files, 1):
         if file.suffix == ".h5":
             section = _section(file)
@@ -106,7 +106,7 @@ def write_report(
             section = _curve(file)
         else:
             require_file(file, most_bytes=MOST_PICTURE_BYTES)
-            section = Section(file.name, [], [Figure(file.read_bytes(), file.name, _media_type(file))])
+            section = ReportSection(file.name, [], [Figure(file.read_bytes(), file.name, _media_type(file))])
         sections.append(section)
         if progress:
             progress(count, len(files))
@@ -115,7 +115,7 @@ def write_report(
     return out
 
 
-def _section(path: Path) -> Section:
+def _section(path: Path) -> ReportSection:
     if is_product(path):
         return _product(path)
     if is_table(path):
@@ -123,7 +123,7 @@ def _section(path: Path) -> Section:
     try:
         return _capture(path)
     except CaptureError as error:
-        return Section(path.name, [("kind", "not shown")], warnings=[str(error)])
+        return ReportSection(path.name, [("kind", "not shown")], warnings=[str(error)])
 
 
 def _kind_of_data(files: Sequence[Path]) -> bool:
@@ -153,7 +153,7 @@ def _range(states: NDArray[np.int64]) -> str:
     return f"{states.min()} to {states.max()}" if states.size else "none"
 
 
-def _capture(path: Path) -> Section:
+def _capture(path: Path) -> ReportSection:
     with Capture(path) as capture:
         header, closing = capture.header, capture.closing
         warnings = [str(m) for m in closing.get("messages", [])]
@@ -190,10 +190,10 @@ def _capture(path: Path) -> Section:
                     [(f"state {state}, counts", frame, {"cmap": "gray"})], header.title, capture.simulated
                 )
                 figures.append(Figure(png(drawn), "first frame of the sample"))
-        return Section(path.name, summary, figures, named, warnings, notes)
+        return ReportSection(path.name, summary, figures, named, warnings, notes)
 
 
-def _product(path: Path) -> Section:
+def _product(path: Path) -> ReportSection:
     with Product(path) as product:
         facts = {k: v for k, v in product.facts.items() if k not in ("warnings", "masked")}
         summary = [("kind", f"{product.kind} image, {'simulated' if product.simulated else 'measured'}")]
@@ -216,7 +216,7 @@ def _product(path: Path) -> Section:
         tables: list[tuple[str, Sequence[Sequence[str]]]] = [("datasets", datasets), *_budgets(product)]
         warnings = list(product.facts.get("warnings", []))
         notes = [("provenance, oldest first", steps_text(product.steps))]
-        return Section(path.name, summary, figures, tables, warnings, notes)
+        return ReportSection(path.name, summary, figures, tables, warnings, notes)
 
 
 #: Numbers whose uncertainty budget a report has, where a product determines them.
@@ -248,14 +248,14 @@ def _budgets(product: Product) -> list[tuple[str, list[tuple[str, ...]]]]:
     ]
 
 
-def _curve(path: Path) -> Section:
+def _curve(path: Path) -> ReportSection:
     try:
         rows = [row for row in csv.reader(read_text(path).splitlines(keepends=True)) if row]
     except csv.Error as error:
         raise ProcessError(f"{path}: cannot be read as CSV ({error})") from error
     shown = [rows[0], *([_rounded(cell) for cell in row] for row in rows[1 : ROWS + 1])] if rows else []
     name = path.name if len(rows) <= ROWS + 1 else f"{path.name}: first {ROWS} of {len(rows) - 1} rows"
-    return Section(path.name, [], (), [(name, shown)] if shown else ())
+    return ReportSection(path.name, [], (), [(name, shown)] if shown else ())
 
 
 def _rounded(cell: str) -> str:

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from processing.reflectance.table_axes import SHAPE
 from processing.reflectance.tables import ScatteringTable, table_steps
 from processing.reports.figure_style import map_figure, png
-from processing.reports.template import Figure, Section
+from processing.reports.template import Figure, ReportSection
 from processing.storage.products.provenance import steps_text
 
 
-def table_section(path: Path) -> Section:
+def table_section(path: Path) -> ReportSection:
     """Numbers of a table, its first quantity over theta_h and theta_d, averaged over phi_d, and its uncertainties."""
     table = ScatteringTable.load(path)
     name = table.quantities[0]
@@ -36,7 +36,7 @@ def table_section(path: Path) -> Section:
     ]
     notes = [("provenance, oldest first", steps_text(table_steps(path)))] if table_steps(path) else []
     if not table.bins.size:
-        return Section(path.name, summary, notes=notes)
+        return ReportSection(path.name, summary, notes=notes)
     mean, count = _over_phi(table, table.mean[0])
     spread = {"cmap": "magma", "origin": "lower"}
     parts = [(part, _over_phi(table, values[0])[0], spread) for part, values in table.uncertainties.items()]
@@ -50,7 +50,7 @@ def table_section(path: Path) -> Section:
         table.simulated,
     )
     figure = Figure(png(drawn), f"{name} over theta_h (up) and theta_d (right)")
-    return Section(path.name, summary, [figure], notes=notes)
+    return ReportSection(path.name, summary, [figure], notes=notes)
 
 
 def _over_phi(table: ScatteringTable, values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

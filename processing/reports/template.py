@@ -24,7 +24,7 @@ class Figure:
 
 
 @dataclass(frozen=True)
-class Section:
+class ReportSection:
     """One file of the report."""
 
     title: str
@@ -35,7 +35,7 @@ class Section:
     notes: Sequence[tuple[str, str]] = ()
 
 
-def render(title: str, simulated: bool, made: str, sections: Sequence[Section]) -> str:
+def render(title: str, simulated: bool, made: str, sections: Sequence[ReportSection]) -> str:
     """HTML text of a report; every text is escaped by the template."""
     warned = [(number, section, text) for number, section in enumerate(sections) for text in section.warnings]
     return (

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from processing.arrays import Array
 from processing.diagnosis.instrument.doubts import PART_OF_LEFT
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES, features
-from processing.diagnosis.instrument.mueller_error import MuellerErrors, Uncertain
+from processing.diagnosis.instrument.mueller_error import MuellerErrors, UncertainMueller
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import Residual
 from processing.diagnosis.search.candidate import Candidate, SourceLevel
@@ -352,7 +352,7 @@ def correction(
     )
 
 
-def _mueller_error(uncertain: Uncertain) -> MuellerError:
+def _mueller_error(uncertain: UncertainMueller) -> MuellerError:
     elements = tuple(float(x) for x in uncertain.of_elements.ravel())
     return MuellerError(elements=elements, rms=uncertain.error.rms_over_m00, most=uncertain.most.short)
 

@@ -97,7 +97,7 @@ def _all_columns(problem: InstrumentProblem, k: int, changes: Changes) -> Array:
 
 
 @dataclass(frozen=True)
-class Uncertain:
+class UncertainMueller:
     """What stays uncertain of M/m00.
 
     Attributes
@@ -164,7 +164,7 @@ class MuellerErrors:
     def _of(self, scope: str) -> NDArray[np.bool_]:
         return np.array([scope_of(c) == scope for c in self.space.candidates for _ in c.parameters], dtype=bool)
 
-    def uncertain(self, problem: InstrumentProblem, used: Solution) -> Uncertain | None:
+    def uncertain(self, problem: InstrumentProblem, used: Solution) -> UncertainMueller | None:
         """What stays uncertain of M/m00 about the values that are applied; None where nothing does."""
         missed = self.values - self.given(used)
         covariance = self.covariance + np.outer(missed, missed)
@@ -188,7 +188,7 @@ class MuellerErrors:
             wavelength_nm=None if several else problem.wavelengths_nm[0],
         )
         alone = [float(np.sum((covariance * largest)[p, p])) for p in self.space.slices]
-        return Uncertain(
+        return UncertainMueller(
             error,
             np.sqrt(np.maximum(of_elements, 0.0)).reshape(4, 4),
             self.space.candidates[int(np.argmax(alone))],

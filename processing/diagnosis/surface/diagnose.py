@@ -46,7 +46,7 @@ from processing.diagnosis.search.stored import parameters_of
 from processing.diagnosis.surface.data import SurfaceData, read_surface
 from processing.diagnosis.surface.guard import chances, checks
 from processing.diagnosis.surface.problem import SurfaceProblem, structure
-from processing.diagnosis.surface.quantities import Quantities, quantities
+from processing.diagnosis.surface.quantities import SurfaceQuantities, quantities
 from processing.diagnosis.surface.standard_errors import bent, standard_errors
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import AppliedEffect, InstrumentModel
@@ -175,8 +175,8 @@ class SurfaceDiagnosis(Diagnosis):
     correction: Correction
     material: str
     constants: dict[str, float]
-    quantities_before: tuple[Quantities, ...]
-    quantities_after: tuple[Quantities, ...]
+    quantities_before: tuple[SurfaceQuantities, ...]
+    quantities_after: tuple[SurfaceQuantities, ...]
     xi0_change: tuple[float, ...]
 
 

@@ -37,7 +37,7 @@ LEAST_POLARIZED = 1e-6
 
 
 @dataclass(frozen=True)
-class Pixels:
+class SurfacePixels:
     """One capture at one set of values, all in units of the noise.
 
     Attributes
@@ -165,7 +165,7 @@ class SurfaceProblem:
         light = np.zeros_like(columns) if extra is None else extra.reshape(-1, 16) @ w.T / self.sigma[k]
         return columns, w[:, 0] / self.sigma[k], light
 
-    def pixels(self, k: int, space: Space, values: Array) -> Pixels:
+    def pixels(self, k: int, space: Space, values: Array) -> SurfacePixels:
         """Projection and residual of one capture.
 
         Where the modelled light is hardly polarized, or p-polarized near the Brewster angle, noise
@@ -190,7 +190,7 @@ class SurfaceProblem:
         alpha_0 = hold * most * (full * modulation + q)
         alpha_id = (level - alpha_0 * np.sum(e * columns, axis=1)) / length
         along = modulation - np.sqrt(hold) * (modulation - full * q)
-        return Pixels(
+        return SurfacePixels(
             e=e,
             f=f,
             hold=hold,
@@ -230,7 +230,7 @@ class SurfaceProblem:
                 out.curvature[fold] += mine @ mine.T
         return out
 
-    def derivatives(self, k: int, space: Space, values: Array, here: Pixels) -> tuple[Array, Array]:
+    def derivatives(self, k: int, space: Space, values: Array, here: SurfacePixels) -> tuple[Array, Array]:
         """Derivatives (K, P, L) of the residual by every value, and (K, P) of the noise that is expected in it."""
         d, less = np.empty((space.size, *here.residual.shape)), np.empty((space.size, len(here.most)))
         typical, tile = space.joined("typical"), self.captures[k].tile

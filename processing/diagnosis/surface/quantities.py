@@ -8,13 +8,13 @@ from processing.arrays import Array
 from processing.diagnosis.search.range_of import rank_of
 from processing.diagnosis.search.rules import SHOWS_XI0
 from processing.diagnosis.search.space import Space
-from processing.diagnosis.surface.problem import Pixels, SurfaceProblem
+from processing.diagnosis.surface.problem import SurfacePixels, SurfaceProblem
 from processing.polarization.cloude import xi0_and_dominant
 from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
 from processing.section import Section
 
 
-class Quantities(Section):
+class SurfaceQuantities(Section):
     """What the model says, one capture.
 
     `psi_deg` and `magnitude_percent` are root mean square differences between the modelled and the measured dominant
@@ -30,7 +30,7 @@ class Quantities(Section):
     unphysical: float
 
 
-def quantities(problem: SurfaceProblem, k: int, space: Space, values: Array) -> tuple[Quantities, Array]:
+def quantities(problem: SurfaceProblem, k: int, space: Space, values: Array) -> tuple[SurfaceQuantities, Array]:
     """What the model with these values says of a capture, and xi0 of its pixels (P,)."""
     here, data = problem.pixels(k, space, values), problem.captures[k]
     xi0 = _xi0(here)
@@ -38,7 +38,7 @@ def quantities(problem: SurfaceProblem, k: int, space: Space, values: Array) -> 
     ideal = data.y - here.residual * problem.sigma[k]
     drawn = np.random.default_rng(0).normal(ideal, problem.sigma[k])
     measured, expected = (dominant_errors(problem, k, space, values, y=y) for y in (data.y, drawn))
-    said = Quantities(
+    said = SurfaceQuantities(
         psi_deg=None if measured is None else rmsd(measured[0]),
         magnitude_percent=None if measured is None else rmsd(measured[1]),
         psi_noise_deg=None if expected is None else rmsd(expected[0]),
@@ -54,7 +54,7 @@ def xi0_of(problem: SurfaceProblem, k: int, space: Space, values: Array) -> Arra
     return _xi0(problem.pixels(k, space, values))
 
 
-def _xi0(here: Pixels) -> Array:
+def _xi0(here: SurfacePixels) -> Array:
     total = here.alpha_0 + here.alpha_id
     with np.errstate(divide="ignore", invalid="ignore"):
         xi0 = (here.alpha_0 + here.alpha_id / 4) / total

@@ -15,7 +15,7 @@ from processing.diagnosis.surface.diagnose import SurfaceDiagnosis, SurfaceJudge
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.quantities import dominant_errors, quantities
 from processing.reports.colours import SIGNED
-from processing.reports.template import Figure, Section, render
+from processing.reports.template import Figure, ReportSection, render
 from processing.whole_file import write_new_text
 
 
@@ -40,7 +40,7 @@ def write_surface_report(path: Path, judged: SurfaceJudged, problem: SurfaceProb
         ("recommendation", d.recommendation),
     ]
     sections = [
-        Section(
+        ReportSection(
             "Diagnosis",
             summary,
             tables=[
@@ -70,7 +70,7 @@ def write_surface_report(path: Path, judged: SurfaceJudged, problem: SurfaceProb
         if before.psi_deg is not None:
             caption = "Dominant process, model less measured, before and after"
             figures.append(Figure(_png(dominant_figure(judged, problem, k)), caption))
-        sections.append(Section(capture.name, facts, figures))
+        sections.append(ReportSection(capture.name, facts, figures))
     title = f"diagnose: {d.material} with {d.instrument}"
     write_new_text(path, render(title, d.simulated, f"{d.wavelengths_nm[0]:g} nm", sections))
 
