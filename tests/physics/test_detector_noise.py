@@ -5,6 +5,7 @@ import pytest
 from bench_capture import bench_capture
 
 from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captured.noise import _compared
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.captured.screening import screened
 from processing.diagnosis.instrument.diagnose import diagnose_captures
@@ -101,3 +102,17 @@ def test_a_fault_of_the_optics_is_no_noise(taken, configs):
     bench.light.append(dark_margin)
     data, _, _ = read(taken(bench, air=False), configs)
     assert not data.told_of_noise
+
+
+def test_a_bright_rim_of_few_pixels_is_no_offset_of_columns():
+    """The mean of a column of two pixels has half of their noise, and they have most of all light."""
+    random, side, states = np.random.default_rng(5), 36, 24
+    inside = np.ones((side, side), dtype=bool)
+    inside[:16, :6], inside[18:, :6] = False, False
+    light = np.where(inside, np.where(np.arange(side) < 6, 5.0, 0.5), np.nan) * np.ones((states, 1, 1))
+    r = np.sqrt(light) * random.standard_normal(light.shape)
+    found = _compared(r, light, 0.01 * light, 1.0)
+    assert found.rows == found.columns == 0
+    found = _compared(r + 0.3 * random.standard_normal((states, 1, side)), light, 0.01 * light, 1.0)
+    assert found.columns == pytest.approx(0.09 / 0.5, rel=0.3)
+    assert found.rows == 0

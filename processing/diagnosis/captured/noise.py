@@ -117,7 +117,7 @@ class DetectorNoise:
     right, down : correlation of neighbours across and down; alike_error : its standard error.
     bent : variance of a pixel over what is declared, by a bend of the response that the residual may show: a response
         that flattens compresses noise too.
-    rows, columns : variance that is common to a row, or a column, of a frame, over that of a pixel; rows_error.
+    rows, columns : variance that is common to a row, or a column, of a frame, over that of a pixel; 0: none shows.
     """
 
     white: float
@@ -132,7 +132,6 @@ class DetectorNoise:
     bent: float
     rows: float
     columns: float
-    rows_error: float
 
 
 def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
@@ -177,11 +176,10 @@ def _compared(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise
     white = float(np.mean([across[lag] for lag in far]))
     # Bright pixels have most of the variance: what scatters is a sum of as many as they are.
     error = white * float(np.sqrt(3 * np.nansum(expected**2) / free)) / float(np.nansum(expected))
-    rows = _common(r, expected, 2) - white * _within(r, 2, 1 - across[1] / white)
-    columns = _common(r, expected, 1) - white * _within(r, 1, 1 - down[1] / white)
-    number = free * r.shape[0] * np.array(r.shape[1:])
-    # Means of a row scatter by the noise of a pixel over the number of its pixels.
-    rows_error = float(white / r.shape[2] * np.sqrt(3 / number[0]))
+    rows, columns = (
+        _common(r / np.sqrt(white), expected, axis, alike=1 - near[1] / white, free=free)
+        for axis, near in ((2, across), (1, down))
+    )
     far_down = float(np.mean([down[lag] for lag in far]))
     shot, floor, covariance = _levels(r, light, dark, free)
     return DetectorNoise(
@@ -192,12 +190,11 @@ def _compared(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise
         covariance=covariance,
         light_share=float(np.nansum(light) / np.nansum(expected)),
         right=1 - across[1] / white,
-        down=1 - (down[1] - max(rows, 0.0)) / max(far_down - max(rows, 0.0), 1e-12),
+        down=1 - (down[1] - white * rows) / max(far_down - white * rows, 1e-12),
         alike_error=float(np.sqrt(2 / count)),
         bent=1.0,
-        rows=max(rows, 0.0) / white,
-        columns=max(columns, 0.0) / white,
-        rows_error=rows_error / white,
+        rows=rows,
+        columns=columns,
     )
 
 
@@ -213,20 +210,23 @@ def _half_square(r: Array, expected: Array, lag: int, axis: int) -> float:
     return float(np.nansum((first - second) ** 2) / np.nansum(np.where(np.isfinite(first - second), one + other, 0)))
 
 
-def _common(r: Array, expected: Array, axis: int) -> float:
-    """The same of means over an axis, in units of the variance of a pixel."""
-    counts = np.isfinite(r).sum(axis=axis)
-    mean = np.nansum(r, axis=axis) / np.maximum(counts, 1)
-    first, second = _pairs(np.where(counts > 0, mean, np.nan), LINES_APART, 1)
-    one, other = _pairs(np.nansum(expected, axis=axis) / np.maximum(counts, 1), LINES_APART, 1)
-    used = np.isfinite(first - second)
-    return float(np.sum((first - second)[used] ** 2) / np.sum((one + other)[used]))
+def _common(r: Array, expected: Array, axis: int, *, alike: float, free: float) -> float:
+    """Variance that is common to a line over that of a pixel, from means over an axis; 0 where it may be chance.
 
-
-def _within(r: Array, axis: int, alike: float) -> float:
-    """Variance of a mean over an axis over that of a pixel, if only neighbours are alike."""
-    counts = np.isfinite(r).sum(axis=axis)
-    return float(np.mean(1 / counts[counts > 0]) * (1 + 2 * max(alike, 0.0)))
+    A line of few pixels tells less, and its mean has more of their noise; of `alike` neighbours more still.
+    """
+    counts = np.maximum(np.isfinite(r).sum(axis=axis), 1)
+    mean, variance = np.nansum(r, axis=axis) / counts, np.nansum(expected, axis=axis) / counts
+    variance[variance == 0] = np.nan
+    of_mean = variance / counts * (1 + 2 * max(alike, 0.0))
+    (first, second), (one, other), (its, own) = (_pairs(x, LINES_APART, 1) for x in (mean, variance, of_mean))
+    noise = its + own
+    weight = (one + other) / noise**2
+    told = np.nansum(weight * (one + other))
+    # Every line is in two differences.
+    error = np.sqrt(3 / free * np.nansum((weight * noise) ** 2)) / told
+    common = float(np.nansum(weight * ((first - second) ** 2 - noise)) / told)
+    return common if common > NOISE_SURE * error else 0.0
 
 
 def _levels(r: Array, light: Array, dark: Array, free: float) -> tuple[float, float, Array]:
@@ -359,7 +359,7 @@ def checked_noise(data: CaptureData, a: Array) -> CaptureData:
             f"neighbours share noise (correlation {found.right:.2f} across, {found.down:.2f} down): the images were "
             f"resampled or smoothed, and of {1 / shared.shown:.1f} pixels one is independent"
         )
-    if max(found.rows, found.columns) > NOISE_SURE * found.rows_error:
+    if found.rows or found.columns:
         shared = _with_lines(shared, found, data)
     lines = _lines(shared, data)
     for name, part in zip(("row", "column"), lines, strict=True):
@@ -392,9 +392,9 @@ def _part(alike: float) -> float:
 
 
 def _with_lines(shared: SharedNoise, found: DetectorNoise, data: CaptureData) -> SharedNoise:
-    rows, columns = (v if v > NOISE_SURE * found.rows_error else 0.0 for v in (found.rows, found.columns))
     height, width = data.usable.shape
-    return replace(shared, rows=rows, columns=columns, wide=1 + rows * width + columns * height)
+    wide = 1 + found.rows * width + found.columns * height
+    return replace(shared, rows=found.rows, columns=found.columns, wide=wide)
 
 
 def _lines(shared: SharedNoise, data: CaptureData) -> tuple[float, float]:
