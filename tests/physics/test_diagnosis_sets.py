@@ -54,6 +54,17 @@ def test_probabilities_are_those_of_all_sets(average):
     assert found.any_of([0, 1]) > 0.99
 
 
+def test_a_rare_cause_of_nearly_all_structure_is_found_behind_common_ones_that_explain_nothing():
+    """What it leaves has a smaller unit, in which it is plain; in the unit of all structure nothing is."""
+    curvature = np.diag([1.0] * 30 + [1500.0])
+    gradient = np.append(np.zeros(30), -np.sqrt(14_500 * 1500.0))
+    made = [*groups(*(1 for _ in range(30))), Group(np.array([30]), price=9.0)]
+    sets = Sets(Quadratic(18_000.0, gradient, curvature), made, Noise(True, directions=24.0, slack=400.0))
+    state = State(np.append(np.zeros(30), TAU[-1]))
+    assert sets.fitted(sets.settled(state)).score > sets.fitted(sets.empty()).score + 2
+    assert np.flatnonzero(likely_set(sets).tau).tolist() == [30]
+
+
 def test_what_is_unlikely_one_by_one_is_likely_together():
     """Thirty weak groups: no set of them is likely, and each keeps its probability and its variance."""
     size, curvature = 30, 50.0

@@ -62,6 +62,11 @@ class Candidate:
         return isinstance(self.effect, InstrumentEffect) and self.effect.moves_image(self.place)
 
     @property
+    def reaches_around(self) -> bool:
+        """Whether it mixes a pixel with those around it."""
+        return isinstance(self.effect, InstrumentEffect) and self.effect.reaches_around(self.place)
+
+    @property
     def is_pointwise(self) -> bool:
         """Whether it changes every count by itself."""
         return isinstance(self.effect, InstrumentEffect) and self.effect.is_pointwise(self.place)

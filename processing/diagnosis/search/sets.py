@@ -89,19 +89,27 @@ class Noise:
     slack: float = 0.0
     floor: float = 1.0
 
-    def unit(self, left: float) -> float:
+    def units(self, left: Array) -> Array:
         """Most likely unit where the excess `left` is left, what the prior takes included."""
-        if self.known:
-            return max(1.0 + max(left - self.slack, 0.0) / self.directions, self.floor)
-        return max(left / self.directions, self.floor)
+        beyond = self.directions + np.maximum(left - self.slack, 0.0) if self.known else left
+        return np.maximum(beyond / self.directions, self.floor)
 
-    def log_likelihood(self, left: float) -> float:
+    def unit(self, left: float) -> float:
+        """The same of one excess."""
+        return float(self.units(np.array(left)))
+
+    def log_likelihoods(self, left: Array) -> Array:
         """Log of the likelihood with the most likely unit."""
-        unit, spread, within = self.unit(left), left, 0.0
+        spread, within = left, np.zeros(())
         if self.known:
             # Within the noise differences count in full.
-            spread, within = self.directions + max(left - self.slack, 0.0), min(left - self.slack, 0.0)
-        return -0.5 * (self.directions * float(np.log(unit)) + spread / unit + within)
+            spread, within = self.directions + np.maximum(left - self.slack, 0.0), np.minimum(left - self.slack, 0.0)
+        unit = self.units(left)
+        return np.asarray(-0.5 * (self.directions * np.log(unit) + spread / unit + within))
+
+    def log_likelihood(self, left: float) -> float:
+        """The same of one excess."""
+        return float(self.log_likelihoods(np.array(left)))
 
 
 @dataclass
@@ -132,10 +140,15 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Conditional(Fitted):
-    """The same, with what it says of every group given the others: log odds (G,), and weights (G, T) of each tau."""
+    """The same, with what it says of every group given the others: log odds (G,), and weights (G, T) of each tau.
+
+    `promise` (G,), `promised` (G,) : the log odds where the unit follows what a group leaves, and its likeliest tau.
+    """
 
     log_odds: Array
     tau_weights: Array
+    promise: Array
+    promised: NDArray[np.int64]
 
 
 class Sets:
@@ -243,6 +256,8 @@ class Sets:
         fit, inverse, right = self._solved(state)
         log_odds = np.full(len(self.groups), np.inf)
         weights = np.zeros((len(self.groups), self.taus.size))
+        promise, promised = log_odds.copy(), np.zeros(len(self.groups), dtype=np.int64)
+        now = self.noise.log_likelihood(fit.left)
         for members, s, q in self._cavities(state, fit, inverse, right):
             # Most groups are one value, which is its own axis: LAPACK would take as long for each as for a matrix.
             alone = s.shape[1] == 1
@@ -250,16 +265,24 @@ class Sets:
             value = np.maximum(value, 0.0)[:, None]
             along = (vector.transpose(0, 2, 1) @ q[:, :, None])[:, None, :, 0] ** 2
             t2 = (self.taus**2)[:, None]
-            gain = 0.5 * np.sum(t2 * along / (1 + t2 * value) - np.log1p(t2 * value), axis=2)
-            gain += np.log(np.maximum(self.tau_weight[members], LEAST_WEIGHT))
+            taken = np.sum(t2 * along / (1 + t2 * value), axis=2)
+            weight = np.log(np.maximum(self.tau_weight[members], LEAST_WEIGHT))
+            # Of a group that is there the posterior has taken it already.
+            left = fit.left - state.unit * np.where(state.tau[members, None] > 0, 0.0, taken)
+            narrower = (state.unit / self.noise.units(left))[..., None]
+            follows = self.noise.log_likelihoods(left) - now - 0.5 * np.sum(np.log1p(t2 * value * narrower), axis=2)
+            promised[members] = np.argmax(follows + weight, axis=1)
+            promise[members] = np.max(follows + weight, axis=1)
+            gain = 0.5 * (taken - np.sum(np.log1p(t2 * value), axis=2)) + weight
             top = gain.max(axis=1, keepdims=True)
             weights[members] = np.exp(gain - top)
             total = weights[members].sum(axis=1, keepdims=True)
             weights[members] /= total
             log_odds[members] = (top + np.log(total))[:, 0]
         there = (state.tau > 0) & self.free
-        log_odds = np.where(self.free, log_odds + self.prior_odds(there), np.inf)
-        return Conditional(fit.active, fit.mean, fit.covariance, fit.left, fit.score, log_odds, weights)
+        log_odds, promise = (np.where(self.free, x + self.prior_odds(there), np.inf) for x in (log_odds, promise))
+        promise = np.where(there, log_odds, promise)
+        return Conditional(**vars(fit), log_odds=log_odds, tau_weights=weights, promise=promise, promised=promised)
 
     def given_others(self, state: State) -> dict[int, tuple[Array, Array]]:
         """Curvature (n, n) and gradient (n,) about zero of every group that may be absent, given the others."""
