@@ -77,6 +77,12 @@ def elapsed_error(time_s: Array, other_s: Array) -> float:
     return float(MAD_TO_SIGMA * np.median(np.abs(steps)) / np.sqrt(2) / np.ptp(time_s))
 
 
+def places(height: int, width: int) -> tuple[Array, Array]:
+    """Where each pixel (rows, columns) of an image is, x to the right and y down, from -1 to 1."""
+    y, x = (np.linspace(-1, 1, size) if size > 1 else np.zeros(1) for size in (height, width))
+    return np.broadcast_to(x, (height, width)), np.broadcast_to(y[:, None], (height, width))
+
+
 def field_terms(x: Array, y: Array) -> Array:
     """(5, ...) the smooth terms, each with mean zero over the image; x and y run from -1 to 1, right and down."""
     return np.stack([x, y, x * x - 1 / 3, x * y, y * y - 1 / 3])
@@ -95,8 +101,9 @@ class Changes:
     coefficients of `field_terms`.
     Detector side: `gain` (N, channels), `stray` (fraction of the mean signal that bypasses the optics), `mixing`
     (channels, channels), `lag` (share of a state that is read with the next one). Count side, what is added to the
-    counts: `response` by feature of the counts, () or (N, channels); `shift_px` (N, 2), by how much the image has moved
-    to the right and down.
+    counts: `response` by feature of the counts, some of them times the place in the image, () or (N, channels);
+    `shift_px` (N, 2), by how much the image has moved to the right and down; `blur_px2` (N,), variance of a blur of
+    each axis, beyond the usual one.
     """
 
     conditions: Conditions
@@ -114,6 +121,7 @@ class Changes:
     lag: float = 0.0
     response: defaultdict[str, Array] = field(default_factory=_zeros)
     shift_px: Array = field(init=False)
+    blur_px2: Array = field(init=False)
     drop_clipped: bool = False
     #: Element matrices that were built before, for one model and capture; a fit changes one element at a time.
     built: dict[tuple[str, bytes], Array] | None = None
@@ -121,6 +129,7 @@ class Changes:
     def __post_init__(self) -> None:
         self.gain = np.ones((self.conditions.states, len(self.conditions.channels)))
         self.shift_px = np.zeros((self.conditions.states, 2))
+        self.blur_px2 = np.zeros(self.conditions.states)
 
     def of_states(self, chosen: NDArray[np.int64]) -> Changes:
         """The same for some of the states, by their positions."""
@@ -137,7 +146,7 @@ class Changes:
             elapsed=c.elapsed[chosen],
             run=c.run[chosen],
         )
-        out.gain, out.shift_px = self.gain[chosen], self.shift_px[chosen]
+        out.gain, out.shift_px, out.blur_px2 = self.gain[chosen], self.shift_px[chosen], self.blur_px2[chosen]
         out.stray = among(np.asarray(self.stray))
         out.after = {key: among(x) if np.ndim(x) == 3 else x for key, x in self.after.items()}
         out.before = {key: among(x) if np.ndim(x) == 3 else x for key, x in self.before.items()}

@@ -31,6 +31,10 @@ LEAST_TURN_DEG = 180.0
 FEWEST_STATES = 7
 #: Courses over the time of one capture.
 TIMES = ("over time", "settling", "warming")
+#: [modes] Of what wanders: half a period to so many halves in a capture; faster waves have a frequency.
+MODES = 12
+#: Sites without a zero of their own: what they do is told from the mean over the capture.
+WITHOUT_ZERO = ("sample", "image")
 #: Quantities that a plate that turns may have.
 OF_A_PLATE = (
     "retardance at 45 degrees",
@@ -45,6 +49,14 @@ OF_THE_PATH = (
     ("circular retardance",),
     ("diattenuation", "diattenuation at 45 degrees"),
     ("depolarization",),
+)
+#: Quantities of the image beside its shift, which has a name where it drifts or goes round once a turn.
+SHIFT = ("shift right", "shift down")
+OF_THE_IMAGE = (("blur",), ("brightness right", "brightness down"))
+#: What has no mechanics wanders: light, counts, the sample and the image.
+WANDERS = (
+    *(("source", ("gain",)), ("detector", ("stray",)), ("detector", ("offset",))),
+    *(("sample", ("azimuth",)), ("image", SHIFT)),
 )
 
 
@@ -64,7 +76,7 @@ GENERATORS: Mapping[str, Array] = {
     "depolarization": -np.diag([0.0, 1.0, 1.0, 1.0]),
     "retardance at 0 degrees": _unit(2, 3) - _unit(3, 2),
 }
-#: [degree], [1], [of full scale] or [pixel] Size of each quantity on a decent bench.
+#: [degree], [1], [of full scale], [pixel] or [square pixel] Size of each quantity on a decent bench.
 SIZES: Mapping[str, tuple[str, float]] = {
     "azimuth": ("degree", 0.3),
     "retardance": ("degree", 0.6),
@@ -81,6 +93,9 @@ SIZES: Mapping[str, tuple[str, float]] = {
     "offset": ("1", 0.0005),
     "shift right": ("pixel", 0.2),
     "shift down": ("pixel", 0.2),
+    "blur": ("square pixel", 0.1),
+    "brightness right": ("1", 0.005),
+    "brightness down": ("1", 0.005),
 }
 
 
@@ -118,6 +133,8 @@ class Sentence:
     def apply(self, changes: Changes, model: InstrumentModel, values: Array) -> None:
         """Add the sentence with these values to the changes."""
         courses = course(self.course, changes.conditions)
+        if self.site in WITHOUT_ZERO:
+            courses = courses - courses.mean(axis=1, keepdims=True)
         parts = values.reshape(len(self.quantities), -1) @ courses
         for quantity, part in zip(self.quantities, parts, strict=True):
             _add(changes, model, self.site, quantity, part=part)
@@ -143,6 +160,8 @@ def parsed(text: str) -> Sentence:
 def _course_names(name: str) -> tuple[str, ...]:
     if name.startswith("beating"):
         return ("cos", "sin", "cos_trend", "sin_trend")
+    if name == "wandering":
+        return tuple(f"mode_{m}" for m in range(1, MODES + 1))
     return ("cos", "sin") if name.startswith("by ") else ("",)
 
 
@@ -162,6 +181,11 @@ def course(name: str, conditions: Conditions) -> Array:
         return np.exp(-k / (n / 10))[None]
     if name == "warming":
         return (1 - np.exp(-k / (n / 2.7)))[None]
+    if name == "wandering":
+        # A random walk about its trend: the amplitude of a wave falls with its frequency.
+        modes = np.arange(1, MODES + 1)[:, None]
+        walk, trend = np.cos(np.pi * modes * (k + 0.5) / n) / modes, np.linalg.qr(np.stack([np.ones(n), k], axis=1))[0]
+        return np.asarray(walk - walk @ trend @ trend.T)
     if name.startswith("beating "):
         # A wave of a frequency between two of the grid grows against its neighbour along the capture.
         turn, trend = 2 * np.pi * float(name.split()[1]) * k / n, 2 * k / n - 1
@@ -189,7 +213,12 @@ def _add(changes: Changes, model: InstrumentModel, site: str, quantity: str, *, 
         changes.lag += float(value[0])
     elif quantity == "offset":
         changes.response["one"] = changes.response["one"] - value[:, None] * np.ones(len(changes.conditions.channels))
-    elif quantity in ("shift right", "shift down"):
+    elif quantity.startswith("brightness"):
+        name = quantity.split()[1]
+        changes.response[name] = changes.response[name] - value[:, None] * np.ones(len(changes.conditions.channels))
+    elif quantity == "blur":
+        changes.blur_px2 = changes.blur_px2 + value
+    elif quantity in SHIFT:
         changes.shift_px = changes.shift_px + np.outer(value, (1, 0) if quantity == "shift right" else (0, 1))
     else:
         _bend(changes, model, site, quantity, value=value)
@@ -233,9 +262,14 @@ def sentences(model: InstrumentModel, conditions: Conditions) -> tuple[Sentence,
         out += _of_element(element, turning, passed, times, front=False)
         if not isinstance(element, Retarder):
             out += _jumps(element.name, "azimuth", states)
-    out += _of_source_and_detector(states, times)
+    out += _of_source_and_detector(states, times, turning)
     # Once a turn it has a name.
-    out += _waves("image", ("shift right", "shift down"), turning, (2,))
+    out += _waves("image", SHIFT, turning, (2,))
+    for quantities in OF_THE_IMAGE:
+        out += _waves("image", quantities, turning, (1, 2))
+        out += [Sentence("image", quantities, time) for time in times[:1]]
+    if states > 2 * MODES:
+        out += [Sentence(site, quantities, "wandering") for site, quantities in WANDERS]
     return tuple(dict.fromkeys(out))
 
 
@@ -289,11 +323,13 @@ def _jumps(site: str, quantity: str, states: int) -> Iterator[Sentence]:
     yield from (Sentence(site, (quantity,), f"from state {k}", price) for k in range(2, states - 1))
 
 
-def _of_source_and_detector(states: int, times: Sequence[str]) -> Iterator[Sentence]:
+def _of_source_and_detector(states: int, times: Sequence[str], turning: Sequence[str]) -> Iterator[Sentence]:
     yield from (Sentence("source", ("gain",), time) for time in times[1:])
     yield from _jumps("source", "gain", states)
     beats = np.arange(1.5, states / 2, 0.5)
     yield from (Sentence("source", ("gain",), f"beating {n:g} times", PRICE + float(np.log(beats.size))) for n in beats)
     yield from (Sentence("detector", (quantity,), time) for quantity in ("stray", "offset") for time in times)
+    # Light that a moving element sends back on its way.
+    yield from _waves("detector", ("stray",), turning, (1, 2, 4))
     if states:
         yield Sentence("detector", ("lag",))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.instrument.changes import places
 from processing.reduction.black import Black
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.flat import FlatField
@@ -161,6 +162,7 @@ class BlockReader:
         self._buffer: NDArray[np.generic] | None = None
         #: First row of the block that was read last.
         self.first_row = 0
+        self._rows = slice(0, 0)
         self._black = np.zeros((1, 1, 1), np.float32)
         self._gain: NDArray[np.float32] | None = None
         self._bad: NDArray[np.bool_] | None = None
@@ -169,7 +171,7 @@ class BlockReader:
 
     def read(self, rows: slice) -> NDArray[np.generic]:
         """Counts (states, channels, pixels) of a row block as stored; the memory is used again by the next call."""
-        self.first_row = rows.start
+        self.first_row, self._rows = rows.start, rows
         height, width = rows.stop - rows.start, self.capture.frame_shape[1]
         channels = self.capture.channels
         shape = (len(self.states), channels, height, width)
@@ -178,7 +180,7 @@ class BlockReader:
             self._buffer = np.empty(math.prod(shape), np.float32 if moved else self.capture.dtype)
         block = self._buffer[: math.prod(shape)].reshape(shape)
         if self.counts is not None and self.counts.moves:
-            self._read_moved(rows, block, self.counts.shift_px, self.counts.pitch)
+            self._read_moved(rows, block, self.counts)
         else:
             self.capture.read_block(self.states, rows, block)
         means, flat, bad = self.correction.black.means, self.correction.flat, self.correction.bad
@@ -206,24 +208,26 @@ class BlockReader:
         out = np.ones(raw.shape, dtype=bool) if level is None else np.less(raw, level)
         return out if self._struck is None else out & ~self._struck[:, :, pixels]
 
-    def _read_moved(self, rows: slice, block: NDArray[np.generic], shift_px: NDArray[np.float64], pitch: int) -> None:
+    def _read_moved(self, rows: slice, block: NDArray[np.generic], counts: CountsCorrection) -> None:
         """Fill `block` with counts of images moved back; beyond an edge of the frame slopes go on.
 
         The black is moved with them, which matters only where it differs from pixel to pixel.
         """
         from processing.reduction.move_image import REACH, shifted_back
 
+        pitch, shift_px = counts.pitch, counts.shift_px
+        blur_px2 = np.broadcast_to(counts.blur_px2, len(self.states))
         # Where the layout has taken the kinds of pixels apart, each image is of one kind.
         apart = pitch * self.capture.frame_shape[0] // self.capture.stored_shape[0]
-        margin = (math.ceil(float(np.abs(shift_px).max()) / pitch) + REACH) * apart
+        margin = (math.ceil(float(np.abs(shift_px).max()) / pitch) + REACH + 1) * apart
         height = self.capture.frame_shape[0]
         first, last = max(rows.start - margin, 0), min(rows.stop + margin, height)
         for k, state in enumerate(self.states):
-            x, y = shift_px[k] / pitch
+            (x, y), blur = shift_px[k] / pitch, float(blur_px2[k]) / pitch**2
             frame = self.capture.frames(int(state), slice(first, last)).astype(np.float32)
             for channel, image in enumerate(frame):
                 for i, j in np.ndindex(apart, apart):
-                    image[i::apart, j::apart] = shifted_back(image[i::apart, j::apart], x, y)
+                    image[i::apart, j::apart] = shifted_back(image[i::apart, j::apart], x, y, blur)
                 block[k, channel] = image[rows.start - first : rows.stop - first]
 
     def load(
@@ -254,5 +258,6 @@ class BlockReader:
         if gain is not None:
             out *= gain
         if self.counts is not None:
-            self.counts.apply(out)
+            place = (at[self._rows].reshape(-1)[pixels] for at in places(*self.capture.frame_shape))
+            self.counts.apply(out, *place)
         return gain

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,27 +27,32 @@ class CountsCorrection:
     response : feature to coefficient, one number or one for each intensity (states, channels).
     shift_px : (states, 2), by how much the image moved to the right and down; it is moved back.
     pitch : pixels from one pixel to the next of its kind: 2 on a polarization mosaic, whose kinds are moved one by one.
+    blur_px2 : (states,) or (1,), variance of a blur along each axis, beyond the usual one; it is taken off.
     """
 
     full_scale: float
     response: dict[str, NDArray[np.float64]]
     shift_px: NDArray[np.float64]
     pitch: int = 1
+    blur_px2: NDArray[np.float64] = field(default_factory=lambda: np.zeros(1))
 
     @property
     def moves(self) -> bool:
-        """Whether any state's image has moved."""
-        return bool(np.any(self.shift_px))
+        """Whether any state's image has moved, or is blurred."""
+        return bool(np.any(self.shift_px) or np.any(self.blur_px2))
 
-    def apply(self, signal: NDArray[np.float32]) -> None:
-        """Correct signals (states, channels, pixels) in counts above black, in place."""
+    def apply(self, signal: NDArray[np.float32], x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+        """Correct signals (states, channels, pixels) in counts above black, in place.
+
+        Of pixels at x and y (pixels,), from -1 to 1 to the right and down.
+        """
         if not self.response:
             return
         u = signal / np.float32(self.full_scale)
         added = np.zeros_like(u)
         for name, coefficient in self.response.items():
             c = np.asarray(coefficient, dtype=np.float32)
-            added += (c.reshape(*c.shape, 1) if c.ndim == 2 else c) * _feature(name, u)
+            added += (c.reshape(*c.shape, 1) if c.ndim == 2 else c) * _feature(name, u, x, y)
         signal += added * np.float32(self.full_scale)
 
 
@@ -106,19 +111,24 @@ def with_extra(changes: Changes, extra: NDArray[np.float64]) -> Changes:
 
 def counts_correction(changes: Changes | None, model: InstrumentModel) -> CountsCorrection | None:
     """The part of the changes that acts on the counts; None if there is none."""
-    if changes is None or not (changes.response or np.any(changes.shift_px)):
+    if changes is None:
         return None
     response = {name: np.asarray(value, dtype=float) for name, value in changes.response.items() if np.any(value)}
-    return CountsCorrection(changes.conditions.full_scale, response, changes.shift_px, model.pitch)
+    out = CountsCorrection(changes.conditions.full_scale, response, changes.shift_px, model.pitch, changes.blur_px2)
+    return out if response or out.moves else None
 
 
 #: Features by which counts are corrected.
-FEATURES = ("one", "square", "cube", "fourth", "log", "log_square", "log_cube")
+FEATURES = ("one", "square", "cube", "fourth", "log", "log_square", "log_cube", "right", "down")
 
 
-def _feature(name: str, u: NDArray[np.float32]) -> NDArray[np.float32] | np.float32:
+def _feature(
+    name: str, u: NDArray[np.float32], x: NDArray[np.float64], y: NDArray[np.float64]
+) -> NDArray[np.float32] | np.float32:
     if name == "one":
         return np.float32(1.0)
+    if name in ("right", "down"):
+        return u * (x if name == "right" else y).astype(np.float32)
     powers = {"square": 2, "cube": 3, "fourth": 4}
     if name in powers:
         return np.asarray(u ** powers[name])

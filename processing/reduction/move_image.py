@@ -1,4 +1,4 @@
-"""Images moved by fractions of a pixel, by interpolation with a spline of fifth order."""
+"""Images moved by fractions of a pixel, by interpolation with a spline of fifth order, and without a slight blur."""
 
 from __future__ import annotations
 
@@ -13,9 +13,13 @@ from scipy import ndimage
 REACH = 10
 
 
-def shifted_back(image: NDArray[np.floating], x_px: float, y_px: float) -> NDArray[np.float32]:
-    """Image (rows, columns) moved back by what it had moved to the right and down; slopes go on beyond its edges."""
-    along_x, along_y = taps(x_px), taps(y_px)
+def shifted_back(image: NDArray[np.floating], x_px: float, y_px: float, blur_px2: float = 0.0) -> NDArray[np.float32]:
+    """Image (rows, columns) moved back by what it had moved to the right and down; slopes go on beyond its edges.
+
+    A blur of this variance along each axis is taken off, to first order; where it is below zero, added.
+    """
+    sharper = np.array([-blur_px2 / 2, 1 + blur_px2, -blur_px2 / 2])
+    along_x, along_y = (np.convolve(taps(shift), sharper) if blur_px2 else taps(shift) for shift in (x_px, y_px))
     x, y = along_x.size // 2, along_y.size // 2
     wide = np.pad(image.astype(np.float32), ((y, y), (x, x)), mode="reflect", reflect_type="odd")
     moved = cv2.sepFilter2D(wide, -1, along_x, along_y)

@@ -166,7 +166,8 @@ class Systematic:
         signal = intensities.astype(np.float32).reshape(-1, self.channels, intensities.shape[1])
         bent = signal.copy()
         if direction.counts is not None:
-            direction.counts.apply(bent)
+            # What grows from the middle of the image to its edges has no error in the middle.
+            direction.counts.apply(bent, np.zeros(1), np.zeros(1))
         return np.asarray((bent - signal).reshape(intensities.shape), dtype=float)
 
     def errors(self, values: NDArray[np.floating], rows: Array | None = None) -> NDArray[np.float32]:

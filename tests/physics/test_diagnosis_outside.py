@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis
@@ -73,6 +74,29 @@ def test_an_image_that_moves_twice_a_turn_is_corrected_without_a_name(configs, t
     found = diagnosed(tmp_path, configs, bench)
     assert not sure(found)
     assert [e.element for e in found.applied()] == ["shift right and shift down of image by 2 x psg"]
+
+
+def test_a_focus_that_follows_a_plate_is_corrected_without_a_name(configs, tmp_path, bench):
+    turn = 2 * np.pi / STATES
+    bench.light.append(lambda k, e: gaussian_filter(e, np.sqrt(0.15 * (1 + np.cos(turn * k))), mode="nearest"))
+    found = diagnosed(tmp_path, configs, bench)
+    assert not sure(found)
+    assert "blur of image by 1 x psg" in [e.element for e in found.applied()]
+
+
+def test_a_cloud_before_the_lamp_is_no_fault_of_a_plate(configs, tmp_path, bench):
+    bench.level.append(lambda k, a: 1 - 0.02 * np.exp(-(((k - 18) / 4) ** 2)))
+    found = diagnosed(tmp_path, configs, bench)
+    assert not sure(found)
+    assert "gain of source wandering" in sentences(found)
+
+
+def test_light_that_moves_over_a_disc_is_no_image_that_moves(configs, tmp_path, bench):
+    x = np.linspace(-1, 1, PIXELS)
+    bench.light.append(lambda k, e: e * (1 + 0.03 * x * (k / (STATES - 1) - 0.5)))
+    found = diagnosed(tmp_path, configs, bench)
+    assert not sure(found)
+    assert [e.element for e in found.applied()] == ["brightness right and brightness down of image over time"]
 
 
 def test_a_black_level_that_drifts_is_no_bent_response(configs, tmp_path, bench):

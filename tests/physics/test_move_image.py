@@ -20,6 +20,16 @@ def test_a_moved_picture_comes_back(shift):
     assert off[3:-3, 3:-3].max() < 2e-2
 
 
+def test_a_slight_blur_is_taken_off_and_one_below_zero_is_added():
+    y, x = np.mgrid[0:60, 0:60].astype(float)
+    sharp, wave = picture(x, y), picture(x, y) - 0.3 * x / 60
+    blurred = sharp + wave * (np.exp(-0.2 / 2 * (1 / 1.5**2 + 1 / 2.1**2)) - 1)
+    inner = (slice(8, -8), slice(8, -8))
+    worse = np.abs(blurred - sharp)[inner].max()
+    assert np.abs(shifted_back(blurred, 0.0, 0.0, 0.2) - sharp)[inner].max() < 0.15 * worse
+    assert np.abs(shifted_back(sharp, 0.0, 0.0, -0.2) - blurred)[inner].max() < 0.15 * worse
+
+
 def test_whole_pixels_are_exact():
     image = np.random.default_rng(0).normal(size=(30, 40)).astype(np.float32)
     assert shifted_back(image, 2.0, -1.0)[5:-5, 5:-5] == pytest.approx(

@@ -117,6 +117,22 @@ def test_counts_are_corrected(rgb950: InstrumentModel, synthetic_capture) -> Non
     assert error(reduced(path, real), truth) < 5e-4
 
 
+def test_light_that_moves_over_the_image_is_levelled(rgb950: InstrumentModel, synthetic_capture) -> None:
+    truth = smooth_scene()
+    light = np.einsum("nck,kxy->ncxy", rgb950.rows(ANGLES), truth.reshape(16, *SHAPE))
+    y, x = (np.linspace(-1, 1, n) for n in SHAPE)
+    turn = np.cos(np.deg2rad(ANGLES["psa"]))
+    # An image has no zero of its own.
+    turn = (turn - turn.mean())[:, None, None, None]
+    path = synthetic_capture(light / (1 - turn * (0.02 * x - 0.01 * y[:, None])), ANGLES, title="test")
+    sentence = "brightness right and brightness down of image by 1 x psa"
+    values = {"brightness_right_cos": 0.02, "brightness_right_sin": 0.0}
+    values |= {"brightness_down_cos": -0.01, "brightness_down_sin": 0.0}
+    real = rgb950.model_copy(update={"effects": (effect("unlisted", sentence, **values),)})
+    assert error(reduced(path, rgb950), truth) > 0.005
+    assert error(reduced(path, real), truth) < 2e-5
+
+
 def test_a_moving_image_is_moved_back(rgb950: InstrumentModel, synthetic_capture) -> None:
     truth = smooth_scene()
     elapsed = np.linspace(-0.5, 0.5, 40)

@@ -51,6 +51,7 @@ from processing.diagnosis.search.rules import (
 )
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
+from processing.instrument.changes import places
 from processing.instrument.effects.base import (
     CountsEffect,
     FieldEffect,
@@ -72,12 +73,12 @@ def closure(problem: InstrumentProblem, k: int, space: Space, values: Array) -> 
     good = data.usable & ~data.clipped
     if not good.any():
         return None
-    means = np.zeros(len(model.channels))
+    means, place = np.zeros(len(model.channels)), [x[good] for x in places(*good.shape)]
     for channel, c in enumerate(model.channels):
         sign = 1.0 if c.name in ("0", "90") else -1.0
         for state in range(data.signal.shape[0]):
             counts = data.signal[state, channel][good].astype(np.float64)
-            corrected = np.tensordot(coefficients[:-DERIVATIVES, state, channel], features(counts)[0], axes=1)
+            corrected = np.tensordot(coefficients[:-DERIVATIVES, state, channel], features(counts, *place)[0], axes=1)
             means[channel] += sign * corrected.mean() / changes.gain[state, channel]
     return float(100 * means.sum() / (np.abs(means).sum() / 2))
 
@@ -420,7 +421,7 @@ def unobservable(problem: InstrumentProblem, found: Posterior) -> list[Candidate
         if candidate.state_chosen or isinstance(candidate.effect, Switch) or np.isin(part.start, always):
             continue
         least = np.full(candidate.size, SEEN)
-        if candidate.moves_image:
+        if candidate.reaches_around:
             # Noise alone has slopes too, from one pixel to the next, which a shift would change.
             one = Space((candidate,))
             noise = np.diag(problem.noise_information(one, np.zeros(one.size))) * candidate.typical**2

@@ -19,7 +19,7 @@ from processing.reduction.move_image import noise_taps
 
 #: Features of a signal u (counts over full scale); corrected counts = u + sum of coefficient times feature.
 FEATURES = (
-    *("counts", "one", "square", "cube", "fourth", "log", "log_square", "log_cube"),
+    *("counts", "one", "square", "cube", "fourth", "log", "log_square", "log_cube", "right", "down"),
     *("dx", "dy", "dxx", "dxy", "dyy"),
 )
 #: [features, fixed] The last of them are derivatives of the image by position.
@@ -43,8 +43,11 @@ PATTERNS = ((POINT, POINT), *((FILTERS[down], FILTERS[across]) for down, across 
 KEPT = 1024
 
 
-def features(u: NDArray[np.floating[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Features of signals that need no neighbours, (F - 5, ...), and their derivatives by the signal, as exact as u."""
+def features(u: NDArray[np.floating[Any]], x: Array, y: Array) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Features of signals that need no neighbours, (F - 5, ...), and their derivatives by the signal, as exact as u.
+
+    Of signals at x and y (...), from -1 to 1 to the right and down.
+    """
     z, slope = np.empty((2, len(FEATURES) - DERIVATIVES, *u.shape), dtype=u.dtype)
     # Products: numpy's powers beyond the second take ten times as long.
     log, square = np.log(np.maximum(u, STRAIGHT_BELOW)), u * u
@@ -58,6 +61,8 @@ def features(u: NDArray[np.floating[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
     z[4], slope[4] = square * square, 4 * cube
     z[5], slope[5] = u * log, log + curved
     z[6], slope[6] = u * log_square, log_square + 2 * log * curved
+    z[8], slope[8] = u * x, x
+    z[9], slope[9] = u * y, y
     z[7], slope[7] = u * log_square * log, log_square * log + 3 * log_square * curved
     return z, slope
 

@@ -29,6 +29,7 @@ from processing.diagnosis.search.rules import (
     TILE_PX,
     TILES,
 )
+from processing.instrument.changes import places
 
 #: [of the largest] Eigenvalues of second moments below this are none.
 LEAST_MOMENT = 1e-15
@@ -191,14 +192,9 @@ def _divided(size: int, parts: int) -> tuple[NDArray[np.int64], list[slice], Arr
     """Which part each pixel of a side is in, the pixels of each part, and their mean place from -1 to 1."""
     number = (np.arange(size) * parts) // size
     ends = np.searchsorted(number, np.arange(parts + 1))
-    place = _places(size)
+    place = places(1, size)[0][0]
     slices = [slice(int(first), int(last)) for first, last in pairwise(ends)]
     return number, slices, np.array([place[part].mean() for part in slices])
-
-
-def _places(size: int) -> Array:
-    """Where each pixel of a side is, from -1 to 1."""
-    return np.linspace(-1, 1, size) if size > 1 else np.zeros(1)
 
 
 def _tiles(pixels: Pixels, pick: BoolArray, grid: _Grid, fold: NDArray[np.int64]) -> Tiles:
@@ -206,7 +202,7 @@ def _tiles(pixels: Pixels, pick: BoolArray, grid: _Grid, fold: NDArray[np.int64]
     left = pixels.shared[:, 0, 0]
     s, noise, number = np.zeros((count, rows, rows)), np.zeros((count, rows)), np.zeros(count)
     x, y = grid.x.copy(), grid.y.copy()
-    place_y, place_x = np.meshgrid(*(_places(size) for size in pick.shape), indexing="ij")
+    place_x, place_y = places(*pick.shape)
     for t, (down, across) in enumerate(grid.boxes):
         mine = pick[down, across]
         weight = 1 / pixels.scale[down, across][mine]

@@ -24,6 +24,7 @@ from processing.diagnosis.instrument.features import (
     inside,
     shared_noise,
 )
+from processing.instrument.changes import places
 
 Precision = type[np.float32] | type[np.float64]
 #: [pixels] Of a strip.
@@ -126,22 +127,24 @@ class Pixels:
             self.variance(slice(None), rows, columns).reshape(count, -1),
             self.scale[rows, columns].reshape(-1),
             self.shared,
+            np.stack([place[rows, columns].reshape(-1) for place in places(*self.scale.shape)]),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Pixels P of a rectangle: signal (L, P), derivatives (5, L, P), variance (L, P) and its mean (P,)."""
+    """Pixels P of a rectangle: signal (L, P), derivatives (5, L, P), variance (L, P), its mean (P,), place (2, P)."""
 
     u: NDArray[Any]
     around: NDArray[np.float32]
     variance: NDArray[np.floating]
     scale: Array
     shared: Array
+    place: Array
 
     def weighted(self, pick: NDArray[np.int64]) -> tuple[NDArray[Any], Array]:
         """Weighted features (F, L, P) of some pixels, and the noise (L, F, F) of their products."""
-        plain, slopes = features(self.u[:, pick])
+        plain, slopes = features(self.u[:, pick], *self.place[:, pick])
         weight = 1 / np.sqrt(self.scale[pick])
         z = np.empty((len(FEATURES), *plain.shape[1:]), dtype=plain.dtype)
         narrow = weight.astype(plain.dtype)

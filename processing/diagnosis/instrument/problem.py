@@ -302,9 +302,14 @@ class InstrumentProblem:
         c[0] = 1.0
         for name, value in changes.response.items():
             c[FEATURES.index(name)] += np.ravel(value)
-        # What the shift took away, to second order, from derivatives of the fitted image (which has no shift).
-        x, y = np.repeat(changes.shift_px / self.captures[capture].pitch, channels, axis=0).T
-        for name, value in (("dx", x), ("dy", y), ("dxx", -x * x / 2), ("dxy", -x * y), ("dyy", -y * y / 2)):
+        # What shift and blur took away, to second order, from derivatives of the fitted image (which has neither).
+        pitch = self.captures[capture].pitch
+        x, y = np.repeat(changes.shift_px / pitch, channels, axis=0).T
+        b = np.repeat(changes.blur_px2 / pitch**2, channels)
+        for name, value in (
+            *(("dx", x), ("dy", y), ("dxy", -x * y)),
+            *(("dxx", -(x * x + b) / 2), ("dyy", -(y * y + b) / 2)),
+        ):
             c[FEATURES.index(name)] = value
         return c
 

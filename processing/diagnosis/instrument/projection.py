@@ -19,6 +19,7 @@ from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES, deri
 from processing.diagnosis.instrument.moments import Block, Moments
 from processing.diagnosis.search.range_of import RANK, range_of
 from processing.diagnosis.search.space import Sums
+from processing.instrument.changes import places
 
 
 class NoiseOfParts:
@@ -98,11 +99,14 @@ def add_response(counts: NDArray[Any], coefficients: Array, a: Array) -> NDArray
         q = range_of(a).astype(counts.dtype)
         fitted = (q @ (q.T @ counts.reshape(counts.shape[0], -1))).reshape(counts.shape)
 
+    x, y = places(*counts.shape[1:])
+
     def strip(rows: slice) -> None:
-        y = np.einsum("fl,flhw->lhw", plain, features(counts[:, rows].astype(float))[0])
+        part = features(counts[:, rows].astype(float), x[rows], y[rows])[0]
+        corrected = np.einsum("fl,flhw->lhw", plain, part)
         if fitted is not None:
-            y += np.einsum("fl,flhw->lhw", around, derivatives_of_part(fitted, rows, slice(0, counts.shape[2])))
-        out[:, rows] = y
+            corrected += np.einsum("fl,flhw->lhw", around, derivatives_of_part(fitted, rows, slice(0, counts.shape[2])))
+        out[:, rows] = corrected
 
     for_strips(counts.shape[1], strip)
     return out

@@ -86,7 +86,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     rows = a.shape[0]
     height, width = data.signal.shape[2:]
     usable = data.usable
-    if data.steep is not None and not any(c.moves_image for c in space.candidates):
+    if data.steep is not None and not any(c.reaches_around for c in space.candidates):
         # Where nothing is said to move, edges must fit as well: a focus that changes shows nowhere else.
         usable = usable | data.steep
     used = (usable & ~data.clipped if changes.drop_clipped else usable) & inside(height, width)

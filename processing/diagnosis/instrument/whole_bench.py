@@ -230,7 +230,7 @@ class WholeBench:
         captures = self.whole.captures
         acting = [k for k, c in enumerate(captures) if candidate.acts(k, c.wavelength_nm)]
         mine = [captures[k] for k in acting]
-        if candidate.moves_image:
+        if candidate.reaches_around:
             return all(min(c.signal.shape[2:]) > 2 * MARGIN + 2 for c in mine)
         if isinstance(effect, PointwiseEffect):
             # With one number a pixel to test, a bend of the response and gains of the channels explain each other. So

@@ -29,7 +29,10 @@ class SentenceEffect(OpticsEffect):
         grammar.parsed(place).apply(changes, model, values)
 
     def moves_image(self, place: str) -> bool:
-        return grammar.parsed(place).site == "image"
+        return grammar.parsed(place).quantities[0].startswith("shift")
+
+    def reaches_around(self, place: str) -> bool:
+        return self.moves_image(place) or grammar.parsed(place).quantities == ("blur",)
 
     def acts_on_counts(self, place: str) -> bool:
         return grammar.parsed(place).site in ("detector", "image")

@@ -51,6 +51,10 @@ class InstrumentEffect(Effect, ABC):
         """Whether it moves the image at this place, which is undone by moving the frames back."""
         return False
 
+    def reaches_around(self, place: str) -> bool:
+        """Whether it mixes a pixel with those around it at this place: the image is moved, or blurred."""
+        return self.moves_image(place)
+
     def acts_on_counts(self, place: str) -> bool:
         """Whether it changes the counts at this place: the image is moved, or the response is bent or shifted."""
         return False

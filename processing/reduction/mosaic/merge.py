@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Image
+from processing.instrument.changes import places
 from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.measurement_matrix import relative_exposure
@@ -115,6 +116,6 @@ def _signal(frame: NDArray[np.generic], black: Image, flat: Image | None, counts
         signal /= flat
     if counts is not None:
         flattened = signal.reshape(1, 1, -1)
-        counts.apply(flattened)
+        counts.apply(flattened, *(at.reshape(-1) for at in places(*signal.shape)))
         signal = flattened.reshape(signal.shape)
     return signal
