@@ -42,6 +42,7 @@ OF_A_PLATE = (
     "diattenuation at 45 degrees",
     "circular diattenuation",
     "depolarization",
+    "inner reflection",
 )
 #: Quantities of the way between the trains.
 OF_THE_PATH = (
@@ -87,6 +88,7 @@ SIZES: Mapping[str, tuple[str, float]] = {
     "diattenuation at 45 degrees": ("1", 0.005),
     "circular diattenuation": ("1", 0.005),
     "depolarization": ("1", 0.003),
+    "inner reflection": ("1", 0.003),
     "gain": ("1", 0.005),
     "stray": ("1", 0.003),
     "lag": ("1", 0.005),
@@ -234,8 +236,13 @@ def _bend(changes: Changes, model: InstrumentModel, site: str, quantity: str, *,
     found = next(e for e in model.elements() if e.name == element)
     behind = any(e.name == element for e in model.generator)
     angle = found.azimuth_rad(changes.conditions.angles_deg, changes.conditions.states)
-    turn, back = mueller.rotation(angle), mueller.rotation(-angle)
-    bent = turn @ _exponential(value[:, None, None] * GENERATORS[quantity]) @ back
+    share = value[:, None, None]
+    if quantity == "inner reflection":
+        # Light that is sent back twice inside a plate passes it three times.
+        own = found.mueller(angle)
+        bent = np.eye(4) + share * (own @ own - np.eye(4))
+    else:
+        bent = mueller.rotation(angle) @ _exponential(share * GENERATORS[quantity]) @ mueller.rotation(-angle)
     (changes.follow if behind else changes.precede)(element, bent)
 
 

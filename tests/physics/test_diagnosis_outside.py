@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis
-from processing.instrument.changes import Conditions
+from processing.instrument.changes import Changes, Conditions
 from processing.instrument.grammar import parsed
 from processing.instrument.grammar import sentences as sentences_of
 from processing.instrument.model import InstrumentModel
@@ -115,6 +115,21 @@ def test_every_sentence_is_read_back_from_its_text(configs):
         read = parsed(sentence.text)
         assert (read.site, read.quantities, read.course) == (sentence.site, sentence.quantities, sentence.course)
     assert "azimuth of analyzer from state 5" in [s.text for s in every]
+
+
+def test_light_that_is_reflected_inside_a_plate_passes_it_three_times(configs):
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
+    angles = {axis: np.rad2deg(angle) for axis, angle in state_angles(STATES, False, False).items()}
+    changes = Changes(Conditions.of(angles))
+    parsed("inner reflection of psa_retarder").apply(changes, model, np.array([0.01]))
+    thrice = [
+        e.model_copy(update={"retardance_deg": 3 * e.retardance_deg}) if e.name == "psa_retarder" else e
+        for e in model.analyzer
+    ]
+    other = model.model_copy(update={"analyzer": tuple(thrice)})
+    assert model.rows(angles, changes) == pytest.approx(
+        0.99 * model.rows(angles) + 0.01 * other.rows(angles), abs=1e-12
+    )
 
 
 def test_a_plate_whose_retardance_changes_twice_a_turn_is_not_called_a_transmission(configs, tmp_path, bench):
