@@ -35,14 +35,14 @@ def climb(sets: Sets, state: State, never: NDArray[np.bool_] | None = None) -> S
     best, barred = sets.fitted(state).score, np.zeros(len(sets.groups), dtype=bool)
     open_to = sets.free if never is None else sets.free & ~never
     for _ in range(STEPS):
-        c = sets.conditional(state)
+        c = sets.conditional(state, follow=True)
         there = state.tau > 0
-        gain = np.where(open_to & ~barred, np.where(there, -c.log_odds, c.promise), -np.inf)
+        gain = np.where(open_to & ~barred, np.where(there, -c.log_odds, c.log_odds), -np.inf)
         k = int(np.argmax(gain))
         if gain[k] < HOPE or barred.sum() > PATIENCE:
             break
         tried = state.copy()
-        tried.tau[k] = 0.0 if there[k] else sets.taus[c.promised[k]]
+        tried.tau[k] = 0.0 if there[k] else sets.taus[int(np.argmax(c.tau_weights[k]))]
         now = sets.fitted(sets.settled(tried)).score
         if now > best:
             state, best = tried, now

@@ -140,15 +140,10 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Conditional(Fitted):
-    """The same, with what it says of every group given the others: log odds (G,), and weights (G, T) of each tau.
-
-    `promise` (G,), `promised` (G,) : the log odds where the unit follows what a group leaves, and its likeliest tau.
-    """
+    """The same, with what it says of every group given the others: log odds (G,), and weights (G, T) of each tau."""
 
     log_odds: Array
     tau_weights: Array
-    promise: Array
-    promised: NDArray[np.int64]
 
 
 class Sets:
@@ -251,13 +246,14 @@ class Sets:
         score = self.noise.log_likelihood(left) - 0.5 * width + self._log_prior(tau)
         return Fitted(active, -inverse.T @ right, inverse.T @ inverse, left, score), inverse, right
 
-    def conditional(self, state: State) -> Conditional:
-        """Posterior of the parameters that are there, and odds of every group given the others."""
+    def conditional(self, state: State, *, follow: bool = False) -> Conditional:
+        """Posterior of the parameters that are there, and odds of every group given the others.
+
+        With `follow` the unit is that which a group leaves, where it is not there yet.
+        """
         fit, inverse, right = self._solved(state)
         log_odds = np.full(len(self.groups), np.inf)
-        weights = np.zeros((len(self.groups), self.taus.size))
-        promise, promised = log_odds.copy(), np.zeros(len(self.groups), dtype=np.int64)
-        now = self.noise.log_likelihood(fit.left)
+        weights, now = np.zeros((len(self.groups), self.taus.size)), self.noise.log_likelihood(fit.left)
         for members, s, q in self._cavities(state, fit, inverse, right):
             # Most groups are one value, which is its own axis: LAPACK would take as long for each as for a matrix.
             alone = s.shape[1] == 1
@@ -266,23 +262,20 @@ class Sets:
             along = (vector.transpose(0, 2, 1) @ q[:, :, None])[:, None, :, 0] ** 2
             t2 = (self.taus**2)[:, None]
             taken = np.sum(t2 * along / (1 + t2 * value), axis=2)
-            weight = np.log(np.maximum(self.tau_weight[members], LEAST_WEIGHT))
-            # Of a group that is there the posterior has taken it already.
-            left = fit.left - state.unit * np.where(state.tau[members, None] > 0, 0.0, taken)
-            narrower = (state.unit / self.noise.units(left))[..., None]
-            follows = self.noise.log_likelihoods(left) - now - 0.5 * np.sum(np.log1p(t2 * value * narrower), axis=2)
-            promised[members] = np.argmax(follows + weight, axis=1)
-            promise[members] = np.max(follows + weight, axis=1)
-            gain = 0.5 * (taken - np.sum(np.log1p(t2 * value), axis=2)) + weight
+            gain = 0.5 * (taken - np.sum(np.log1p(t2 * value), axis=2))
+            if follow and (new := state.tau[members] == 0).any():
+                left = fit.left - state.unit * taken[new]
+                wider = np.log1p(t2 * value[new] * (state.unit / self.noise.units(left))[..., None])
+                gain[new] = self.noise.log_likelihoods(left) - now - 0.5 * np.sum(wider, axis=2)
+            gain += np.log(np.maximum(self.tau_weight[members], LEAST_WEIGHT))
             top = gain.max(axis=1, keepdims=True)
             weights[members] = np.exp(gain - top)
             total = weights[members].sum(axis=1, keepdims=True)
             weights[members] /= total
             log_odds[members] = (top + np.log(total))[:, 0]
         there = (state.tau > 0) & self.free
-        log_odds, promise = (np.where(self.free, x + self.prior_odds(there), np.inf) for x in (log_odds, promise))
-        promise = np.where(there, log_odds, promise)
-        return Conditional(**vars(fit), log_odds=log_odds, tau_weights=weights, promise=promise, promised=promised)
+        log_odds = np.where(self.free, log_odds + self.prior_odds(there), np.inf)
+        return Conditional(**vars(fit), log_odds=log_odds, tau_weights=weights)
 
     def given_others(self, state: State) -> dict[int, tuple[Array, Array]]:
         """Curvature (n, n) and gradient (n,) about zero of every group that may be absent, given the others."""
