@@ -23,7 +23,8 @@ from drivers.text_line import TextLine
 
 # Pulses a second, and milliseconds from start to this speed: the homing of a GSC-01 and a GSC-02.
 HOMING_PPS = 5000
-_STATUS = re.compile(r"\s*([+-]?\s*\d+\s*,\s*)+[XK],[KLMW],[BR]")
+# The sign stands apart from its digits, with blanks and nothing else between.
+_STATUS = re.compile(r" *([+-]? *\d+ *, *)+[XK],[KLMW],[BR]")
 _VERSION = re.compile(r"(?!OK$|NG$)[\w .-]+")
 # At a limit switch: the first axis, the second, both.
 _AT_LIMIT = {"L": (1,), "M": (2,), "W": (1, 2)}

@@ -71,6 +71,18 @@ def test_gsc_moves_are_relative_and_asked_for() -> None:
             gsc.open("psa", gsc.Config(port=path, axis=2), lines)
 
 
+def test_a_disturbed_blank_in_a_status_of_a_gsc_is_asked_for_again() -> None:
+    with (
+        scripted(
+            (b"?:V\r\n", b"V1.10\r\n"),
+            (b"Q:\r\n", b"-\x1c     400,K,K,R\r\n"),
+            (b"Q:\r\n", b"-      400,K,K,R\r\n"),
+        ) as path,
+        LineRegistry(clock=patient_clock()) as lines,
+    ):
+        gsc.open("psg", gsc.Config(port=path, rtscts=False, reply_s=0.2), lines)
+
+
 def test_owis_makes_an_axis_ready_before_it_goes() -> None:
     def at(letters: bytes) -> tuple[bytes, bytes]:
         return b"?ASTAT\r", letters + b"\r"
