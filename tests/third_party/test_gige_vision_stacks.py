@@ -85,10 +85,11 @@ def test_our_driver_drives_the_camera_of_viva_genicam(pixel_format: str) -> None
 
     with (
         FakeGigeCamera(width=640, height=480, pixel_format=pixel_format) as fake,
-        aravis.open("camera", aravis.Config(device=fake.ip, retakes=0)) as camera,
+        # It does not wait for its exposure.
+        aravis.open("camera", aravis.Config(device=fake.ip, retakes=0, answers_early=True)) as camera,
     ):
         assert camera.describe().model == "VivaCam Fake"
-        camera.configure(CameraSettings(exposure_s=0.02, pixel_format=pixel_format))
+        camera.configure(CameraSettings(exposure_s=0.02, pixel_format=pixel_format, width=640, height=480))
         triggers = fake.software_triggers()
         frames = camera.capture(3)
         assert fake.software_triggers() - triggers == len({frame.frame_id for frame in frames}) == 3
