@@ -93,7 +93,7 @@ def open_campaign(folder: Path | str, kind: str = "mueller") -> xr.Dataset:
         omega = np.nan if header.omega_deg is None else header.omega_deg
         places.setdefault((sample.name or sample.kind, header.wavelength_nm, omega), []).append(path)
     if first is None:
-        raise ProcessError(f"{folder}: no product of kind {kind!r}. Make them with: ./lab process reduce {folder}")
+        raise ProcessError(f"{folder}: no product of kind {kind!r}. Make them: umov process reduce {folder}")
     # NaN is not equal to itself: angles are compared as text.
     axes = [sorted({str(place[k]): place[k] for place in places}.items(), key=lambda item: item[1]) for k in range(3)]
     shape = (*(len(axis) for axis in axes), max(len(paths) for paths in places.values()))
@@ -169,7 +169,7 @@ def follow_region(folder: Path | str, region: str | None = None, kind: str = "mu
         stamp = np.datetime64(moment, "ns")
         lines.append((str(path), sample, header.wavelength_nm, omega, stamp, means))
     if not lines:
-        raise ProcessError(f"{folder}: no product of kind {kind!r}. Make them with: ./lab process reduce {folder}")
+        raise ProcessError(f"{folder}: no product of kind {kind!r}. Make them: umov process reduce {folder}")
     file, *columns, found = zip(*lines, strict=True)
     labels = ("sample", "wavelength", "omega", "time")
     coords = {label: ("file", list(column)) for label, column in zip(labels, columns, strict=True)}

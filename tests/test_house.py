@@ -140,7 +140,9 @@ def test_a_page_that_speaks_of_the_paper_names_it():
 
 def test_every_page_of_the_docs_is_in_the_site():
     named = set(re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
-    assert named == {str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")}
+    pages = {str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")}
+    # Made of the notebooks when the site is built.
+    assert named == pages | {f"notebook-{page.stem}.md" for page in (ROOT / "examples").glob("*.ipynb")}
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
-from processing.commands.purposes import PURPOSES
+from processing.commands.purposes import FIRST, PURPOSES
 from processing.doors import CONTROL
 from processing.errors import ProcessError
 
@@ -54,11 +54,15 @@ class Commands(TyperGroup):
             rows = [
                 # Padded: the summaries of all lists begin in one column.
                 (name.ljust(widest), command.get_short_help_str(limit=1000))
-                for name, command in shown.items()
+                for name, command in sorted(shown.items(), key=lambda item: _rank(item[0]))
                 if (getattr(command, "rich_help_panel", None) or "Commands") == purpose
             ]
             with formatter.section(purpose):
                 formatter.write_dl(rows)
+
+
+def _rank(name: str) -> tuple[int, str]:
+    return (FIRST.index(name) if name in FIRST else len(FIRST), name)
 
 
 class Application(typer.Typer):

@@ -119,10 +119,12 @@ def _load(
     allow_holes: bool,
 ) -> _World:
     del stamp  # a part of the cache's key: the file may change
-    import trimesh
-    from embreex import rtcore_scene
-    from embreex.mesh_construction import TriangleMesh
-
+    try:
+        import trimesh
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh
+    except ImportError as error:
+        raise GeometryError(f"{path}: a mesh needs trimesh and embreex. Type: pip install 'umov[paper]'") from error
     require_file(path, GeometryError, MOST_MESH_BYTES)
     try:
         mesh = trimesh.load_mesh(path)

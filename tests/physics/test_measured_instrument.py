@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
@@ -27,10 +28,10 @@ def measured(rows, **more):
     return {"kind": "instrument", "name": "lc", "generator": [], "analyzer": [], "measured": state | more}
 
 
-def capture_of(synthetic_capture, w, m, model, order=None):
+def capture_of(synthetic_capture, w, m, model, *, order=None, shape=(6, 8), gain=1.0):
     order = np.arange(len(w)) if order is None else order
-    signal = (w[order] @ m)[:, None, None, None] * 2e4 * np.ones((1, 1, 6, 8))
-    detector = {"black_level_counts": 0.0, "gain_e_per_count": 1.0, "read_noise_e": 1.0, "bits": 16}
+    signal = (w[order] @ m)[:, None, None, None] * 2e4 * np.ones((1, 1, *shape))
+    detector = {"black_level_counts": 0.0, "gain_e_per_count": gain, "read_noise_e": gain, "bits": 16}
     return synthetic_capture(
         np.round(signal).astype(np.uint16),
         {"state": order.astype(float)},
@@ -46,7 +47,7 @@ def test_a_measured_w_reduces_a_mueller_capture_in_any_order(synthetic_capture):
     w = np.einsum("ni,nj->nij", a, g).reshape(24, 16)
     model = InstrumentModel.model_validate(measured(w))
     true = (mueller.retarder(0.4, 1.1) @ mueller.diattenuator(0.2, 1.0, 0.6)).reshape(16)
-    path = capture_of(synthetic_capture, w, true, model, RNG.permutation(24))
+    path = capture_of(synthetic_capture, w, true, model, order=RNG.permutation(24))
     image = MuellerImage.load(Reduction(path).make())
     m = image.values.mean(axis=(2, 3)).reshape(16)
     assert image.seen.all()
@@ -84,6 +85,16 @@ def test_a_measured_w_needs_neither_trains_nor_numbers_of_its_states():
     short = InstrumentModel.model_validate({"name": "lc", "measured": {"rows": w.tolist()}})
     long = InstrumentModel.model_validate(measured(w))
     np.testing.assert_array_equal(short.rows({"state": [4, 0]}), long.rows({"state": [4, 0]}))
+
+
+@pytest.mark.parametrize("gain", [None, 1.0])
+def test_frames_without_noise_are_refused_in_words(synthetic_capture, gain):
+    g, a = states_of(20), states_of(20)
+    w = np.einsum("ni,nj->nij", a, g).reshape(20, 16)
+    model = InstrumentModel.model_validate(measured(w))
+    path = capture_of(synthetic_capture, w, np.eye(4).reshape(16), model, shape=(24, 32), gain=gain)
+    with pytest.raises(ProcessError, match="its frames have no noise"):
+        diagnose_captures([path], model)
 
 
 def test_a_state_that_was_not_measured_is_refused_by_its_angles():

@@ -36,6 +36,7 @@ from processing.diagnosis.search.rules import (
     SMALL,
 )
 from processing.instrument.grammar import TIMES, course
+from processing.storage.captures.capture import CaptureError
 
 #: [components, fixed] Of the states that count as signal: a Mueller matrix has 16 unknowns.
 COMPONENTS = 16
@@ -100,6 +101,8 @@ def estimated_noise(data: CaptureData) -> CaptureData:
 MOST_VALUES = 4_000_000
 #: [of what is declared] Least part of the variance that weights are made of.
 LEAST_PART = 0.01
+#: [of the signal] Scatter of pixels below which it is that of rounded numbers.
+ROUNDING = 1e-6
 #: [unit of chi-square] Weight of the belief that both parts of the noise are as declared, where the images do not tell
 #: them apart.
 WEAK = 1e-3
@@ -135,7 +138,12 @@ class DetectorNoise:
 
 
 def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
-    """Noise of a capture against rows a (L, K) of its model; None where its images do not show it."""
+    """Noise of a capture against rows a (L, K) of its model; None where its images do not show it.
+
+    Raises
+    ------
+    CaptureError : the frames have none.
+    """
     height, width = data.usable.shape
     if min(height, width) < NARROWEST:
         return None
@@ -155,6 +163,12 @@ def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
     r[:, good] = rest @ white.y
     dark[:, good] = (rest**2 @ floor)[:, None]
     light[:, good] = rest**2 @ white.variance - dark[:, good]
+    scatter = np.sqrt(_half_square(r, light + dark, NOT_ALIKE_PX, 2)) * white.level.mean()
+    if not scatter > ROUNDING * float(np.mean(np.abs(data.signal[..., part, :]))):
+        raise CaptureError(
+            f"{data.name}: its frames have no noise: neighbouring pixels differ by less than numbers are rounded. "
+            "`diagnose` weighs each difference by the noise. Give frames of a camera, or add noise to calculated ones."
+        )
     return replace(_compared(r, light, dark, float(np.trace(rest)) / len(rest)), bent=_of_a_bend(white))
 
 
