@@ -60,7 +60,7 @@ class PageJob:
     @property
     def typed(self) -> str:
         """The command for a console."""
-        return "./lab " + shlex.join(self.command)
+        return shlex.join([os.environ.get("UMOV_DOOR", "./lab"), *self.command])
 
 
 class Jobs:

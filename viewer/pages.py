@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,8 @@ class Pages:
             "address": self.address,
             "unacknowledged": unacknowledged,
             "ago": ago,
+            # As the user started this program, in commands that a page suggests.
+            "door": os.environ.get("UMOV_DOOR", "./lab"),
         }
         self._templates.filters |= {"megabytes": megabytes, "when": when}
 

@@ -220,7 +220,8 @@ def test_a_few_states_tell_no_lamp_yet(flickering):
         assert lamp(capture)["told"] == "no light state is done yet"
 
 
-def test_a_command_is_followed_to_its_end_and_known_afterwards(lab, client, drr_capture):
+def test_a_command_is_followed_to_its_end_and_known_afterwards(lab, client, drr_capture, monkeypatch):
+    monkeypatch.setenv("UMOV_DOOR", "./lab")
     drr_capture("one.h5", shape=(4, 4))
     origin = {"origin": "http://127.0.0.1:8000"}
     answer = client.post("/start", json={"what": "reduce", "file": "one.h5"}, headers=origin)

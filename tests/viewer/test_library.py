@@ -112,3 +112,10 @@ def test_a_browser_sorts_turns_pages_and_shows_thumbnails(lab, drr_capture, addr
         page.set_viewport_size({"width": 380, "height": 800})
         assert page.evaluate("document.documentElement.scrollWidth") <= 380
         browser.close()
+
+
+def test_pages_suggest_the_program_that_was_started(lab, monkeypatch):
+    monkeypatch.setenv("UMOV_DOOR", "umov")
+    empty = TestClient(application(lab, "token"), base_url="http://127.0.0.1:8000/token")
+    assert "<code>umov acquire" in empty.get("/").text
+    assert "<code>umov process reduce" in empty.get("/stack").text
