@@ -408,9 +408,3 @@ def _put(planes: Planes, name: str, value: Array, error: Array, *ends: Array) ->
     planes[name] = np.asarray(value, dtype=np.float32)
     planes[f"{name}_errors"] = np.asarray(error, dtype=np.float32)
     planes[f"{name}_95"] = np.stack(ends).astype(np.float32)
-
-
-def _normal(planes: Planes, name: str) -> Planes:
-    """Value, error and the interval of a normal distribution."""
-    value, error = planes[name].astype(float), planes[f"{name}_errors"].astype(float)
-    return {"value": value, "error": error, "low": value - NORMAL_95 * error, "high": value + NORMAL_95 * error}
