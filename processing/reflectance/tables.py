@@ -228,11 +228,13 @@ class ScatteringTable:
             describe_light(entry, self.wavelength_nm, "those of the captures in the table")
             self._lay_out_bins(add_group(entry, "data", "NXdata"), title)
             sums = add_group(entry, "sums", "NXcollection")
+            add_scales(sums, {"quantity": len(self.quantities), "bin": self.bins.size})
             for name, values in zip(_SUMS, (self._sum[: len(self.quantities)], self._square), strict=True):
                 text = f"{name} over the samples of a bin"
-                _put(sums, name, values, entry["data"], dimensions=("quantity", "bin"), units="", long_name=text)
+                _put(sums, name, values, sums, dimensions=("quantity", "bin"), units="", long_name=text)
             for name in AXES:
                 sums[name] = getattr(self.axes, name)
+                sums[name].make_scale(name)
                 sums[name].attrs.update({"units": "degree", "long_name": "centres of all bins along the axis"})
             write_steps(entry, steps)
             sign(h5, steps)
@@ -251,7 +253,7 @@ class ScatteringTable:
             long_name="number of the bin, counted over theta_h, theta_d, phi_d",
         )
         data["bin"].make_scale("bin")
-        data["quantity_name"] = [name.encode() for name in self.quantities]
+        data["quantity_name"] = np.array([name.encode() for name in self.quantities], dtype="S")
         attach(data["quantity_name"], data, ["quantity"])
         _put(data, "count", self.count, data, dimensions=["bin"], units="", long_name="samples in the bin")
         for name, angle in zip(AXES, self.axes.angles(self.bins), strict=True):
@@ -288,7 +290,7 @@ class ScatteringTable:
                 _put(data, name, values, data, dimensions=("quantity", "bin"), units=self.units, long_name=text)
         if self.inputs:
             add_scales(data, {"input": len(self.inputs)})
-            data["input_name"] = [name.encode() for name in self.inputs]
+            data["input_name"] = np.array([name.encode() for name in self.inputs], dtype="S")
             attach(data["input_name"], data, ["input"])
             text = "what one standard uncertainty of each uncertain input of the instrument does to the mean"
             dimensions = ("input", "quantity", "bin")

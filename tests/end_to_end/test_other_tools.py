@@ -117,6 +117,14 @@ def test_a_whole_product_is_a_tree_for_xarray_with_names_for_all_dimensions(prod
         )
 
 
+def test_dask_chooses_chunks_of_every_file(capture, product, table):
+    """Text of any length is an object to numpy, whose size dask cannot tell."""
+    for path in (capture, product, table):
+        with xr.open_datatree(path, engine="h5netcdf", chunks="auto") as tree:
+            assert any(array.chunks for node in tree.subtree for array in node.ds.values())
+            assert not [d for node in tree.subtree for d in node.ds.dims if str(d).startswith("phony")]
+
+
 def test_the_default_plot_has_its_axes_and_coordinates(capture, product, table):
     for path in (capture, product, table):
         with h5py.File(path) as h5:

@@ -211,7 +211,8 @@ def create_layout(
     _detector(entry, header, create(entry["instrument/detector"], "data", (n, c, *frame_shape), dtype))
 
     states = add_group(entry, "states", "NXcollection")
-    states["role"] = [r.encode() for r in role]
+    # Text of one length: dask cannot divide columns of another kind.
+    states["role"] = np.array(role, dtype="S")
     attach(states["role"], entry, ["state"])
     for name, kind in STATE_COLUMNS.items():
         empty = np.nan if np.issubdtype(kind, np.floating) else EMPTY.get(name, 0)
@@ -281,7 +282,7 @@ def _detector(entry: h5py.Group, header: CaptureHeader, frames: h5py.Dataset) ->
     sums.attrs["units"] = ""
     for dataset in (frames, sums):
         attach(dataset, entry, ["state", "channel", *PIXEL_AXES])
-    detector["channels"] = [name.encode() for name in header.channels]
+    detector["channels"] = np.array([name.encode() for name in header.channels], dtype="S")
     attach(detector["channels"], entry, ["channel"])
     for key, units in DETECTOR_UNITS.items():
         value = getattr(header.detector, key)
