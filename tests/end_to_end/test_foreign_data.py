@@ -150,6 +150,34 @@ def test_scenes_of_a_polarization_camera_are_not_averaged(configs, tmp_path, pro
     assert again[1].splitlines()[-1] == "3 inputs: 0 made, 3 unchanged, 0 failed"
 
 
+def test_two_beams_on_one_sensor(tmp_path, process):
+    plate = "{kind: retarder, name: plate, axis: hwp, azimuth_deg: 0, retardance_deg: 180}"
+    channels = "".join(
+        f"  - {{name: {name}, elements: [{{kind: polarizer, name: p_{name}, azimuth_deg: {angle}}}]}}\n"
+        for name, angle in (("o", 0), ("e", 90))
+    )
+    text = (
+        f"kind: instrument\nname: wollaston\ngenerator: []\nanalyzer: [{plate}]\nchannels:\n{channels}beams: [o, e]\n"
+    )
+    (tmp_path / "beams.yaml").write_text(text)
+    angles = {"hwp": np.array([0, 22.5, 45, 67.5])}
+    light = np.zeros(16)
+    light[::4] = 1, 0.3, -0.2, 0
+    signal = InstrumentModel.load(tmp_path / "beams.yaml").at(550).rows(angles) @ light * 8000
+    for angle, pair in zip(angles["hwp"], signal, strict=True):
+        frame = np.repeat(pair, 6)[None].repeat(4, axis=0).round().astype(np.uint16)
+        cv2.imwrite(str(tmp_path / f"hwp_{angle}.tif"), frame)
+    out = tmp_path / "c.h5"
+    command = ("import", "--stack", tmp_path / "hwp_{hwp}.tif", "--wavelength-nm", 550)
+    code, _, said = process(*command, "--instrument", tmp_path / "beams.yaml", "--out", out)
+    assert code == 0, said
+    with Capture(out) as capture:
+        assert (capture.channel_names, capture.frame_shape) == (("o", "e"), (4, 6))
+    assert process("reduce", out)[0] == 0
+    s = MuellerImage.load(out.with_suffix(".mueller.h5")).values[:, 0].mean(axis=(1, 2))
+    assert s[:3] / s[0] == pytest.approx(light[:12:4], abs=2e-3)
+
+
 def test_a_liquid_crystal_polarimeter_has_a_measured_w_and_no_angles(tmp_path, process):
     rng = np.random.default_rng(4)
     w = rng.normal(0, 0.1, (20, 16)) + np.eye(16)[0]

@@ -21,6 +21,7 @@ from processing.computing.threads import thread_count
 from processing.doors import one_line, read_text, require_picture, require_place, require_room
 from processing.instrument.measured import NUMBER
 from processing.instrument.model import InstrumentModel
+from processing.storage.captures.frame_layout import Beams
 from processing.storage.captures.nexus import attach
 from processing.storage.captures.schema import CaptureHeader, Detector, Sample, create_layout, write_closing
 from processing.storage.formats.doubtful_units import require_nm, require_unit
@@ -102,6 +103,9 @@ def understand(request: ImportRequest) -> Understood:
     found = frame_files(request.stack) if request.stack is not None else None
     places = _places(request.stack, found)
     names = tuple(c.name for c in model.channels) if model and model.mosaic is None else ("camera",)
+    if model is not None and model.beams and (places or (request.stack and _dimensions(request.stack) == 3)):
+        # Beams on one sensor: their images are cut apart when the capture is read.
+        names = ("beams",)
     count = None
     if model is not None and set(model.axes) <= {NUMBER} and request.stack is not None and request.states is None:
         # Nothing turns: each frame is a state, and no table has to say more of it.
@@ -158,6 +162,10 @@ def _places(stack: str | None, found: FrameFiles | None) -> tuple[Place, ...]:
         return ()
     pages = require_picture(file, ImportFailed)
     return tuple((file, page) for page in range(pages)) if pages > 1 else ((file, None),)
+
+
+def _dimensions(stack: str) -> int:
+    return len(open_stack(stack, None).shape)
 
 
 def _count(stack: str, channels: int) -> int:
@@ -230,6 +238,12 @@ def import_capture(request: ImportRequest, progress: Progress | None = None) -> 
     detector = request.detector
     if detector.bits is None and source.dtype.kind == "u":
         detector = detector.model_copy(update={"bits": 8 * source.dtype.itemsize})
+    beams = model.beams if model and source.channels == ("beams",) else None
+    if beams:
+        try:
+            Beams(beams).shape(source.shape[1:])
+        except ValueError as error:
+            raise ImportFailed(f"{states.path}: {error}") from error
     header = CaptureHeader(
         title=request.title or one_line(f"imported from {states.path.resolve().parent.name}/{states.path.name}"),
         simulated=False,
@@ -240,6 +254,7 @@ def import_capture(request: ImportRequest, progress: Progress | None = None) -> 
         detector=detector,
         channels=source.channels,
         mosaic=model.mosaic if model else None,
+        beams=beams,
         instrument_yaml=request.instrument.read_text(encoding="utf-8") if request.instrument else "",
         versions={"umov": version("umov"), "numpy": np.__version__, "h5py": h5py.__version__},
     )
