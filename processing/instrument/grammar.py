@@ -54,11 +54,6 @@ OF_THE_PATH = (
 #: Quantities of the image beside its shift, which has a name where it drifts or goes round once a turn.
 SHIFT = ("shift right", "shift down")
 OF_THE_IMAGE = (("blur",), ("brightness right", "brightness down"))
-#: What has no mechanics wanders: light, counts, the sample and the image.
-WANDERS = (
-    *(("source", ("gain",)), ("detector", ("stray",)), ("detector", ("offset",))),
-    *(("sample", ("azimuth",)), ("image", SHIFT)),
-)
 
 
 def _unit(i: int, j: int) -> Array:
@@ -276,7 +271,7 @@ def sentences(model: InstrumentModel, conditions: Conditions) -> tuple[Sentence,
         out += _waves("image", quantities, turning, (1, 2))
         out += [Sentence("image", quantities, time) for time in times[:1]]
     if states > 2 * MODES:
-        out += [Sentence(site, quantities, "wandering") for site, quantities in WANDERS]
+        out.append(Sentence("source", ("gain",), "wandering"))
     return tuple(dict.fromkeys(out))
 
 
