@@ -55,26 +55,29 @@ def diagnose_command(
     model = full_model(captures[0], instrument)
     with progress_line("diagnose", verbose) as say:
         judged, problem = diagnose_captures(captures, model, say)
-    show(judged.diagnosis, verbose, written=write is not None)
+    # Files first: who reads the words may go before their end.
+    made = [str(path) for path in (report, residuals, write) if path is not None]
     if json is not None:
         write_result(json, judged.diagnosis)
     if report is not None:
         from processing.diagnosis.instrument.report import write_report
 
         write_report(report, judged, problem)
-        typer.echo(str(report))
     if residuals is not None:
         from processing.diagnosis.instrument.residual_file import write_residuals
 
         write_residuals(residuals, judged, problem)
-        typer.echo(str(residuals))
     if write is not None:
         from processing.diagnosis.instrument_file import write_instrument
 
         write_instrument(write, model, judged.diagnosis)
         if not judged.diagnosis.corrects:
-            typer.echo("nothing is corrected; the file adds how wrong M may be, for the error bars of `process reduce`")
-        typer.echo(str(write))
+            made[-1:-1] = [
+                "nothing is corrected; the file adds how wrong M may be, for the error bars of `process reduce`"
+            ]
+    show(judged.diagnosis, verbose, written=write is not None)
+    for line in made:
+        typer.echo(line)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -42,18 +42,21 @@ def diagnose_reflectance(
     )
     with progress_line("diagnose", verbose) as say:
         judged, problem = diagnose_object(captures, model, material, view, say=say)
-    show(judged.diagnosis, verbose, written=write is not None)
-    _show_surface(judged.diagnosis)
+    # Files first: who reads the words may go before their end.
+    made = []
     if json is not None:
         write_result(json, judged.diagnosis)
     if report is not None:
         from processing.diagnosis.surface.report import write_surface_report
 
         write_surface_report(report, judged, problem)
-        typer.echo(str(report))
+        made.append(report)
     if write is not None:
-        for path in write_surface(write, judged.diagnosis, material, view, instrument=model):
-            typer.echo(str(path))
+        made += write_surface(write, judged.diagnosis, material, view, instrument=model)
+    show(judged.diagnosis, verbose, written=write is not None)
+    _show_surface(judged.diagnosis)
+    for path in made:
+        typer.echo(str(path))
 
 
 def _show_surface(d: SurfaceDiagnosis) -> None:
