@@ -98,7 +98,9 @@ class ControlChannel:
 
     def _serve(self, channel: socket.socket) -> None:
         while self._socket is channel:
-            self._let_go_of_the_silent()
+            # What waits was sent while this thread had no turn: its sender was not silent.
+            if not select.select([channel], [], [], 0)[0]:
+                self._let_go_of_the_silent()
             for heard in select.select(self._heard, [], [], _SLICE_S)[0]:
                 # The port of somebody who is gone; the next packet is another's. A packet that is too short for what it
                 # says is nobody's command.
