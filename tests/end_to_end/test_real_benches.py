@@ -167,9 +167,9 @@ def test_answer_to_a_small_bench_harms_nothing(group, seed, given, configs, tmp_
 
 #: Groups with one fault or none: capture that is given, and seeds. The seed goes through the faults of a group in turn.
 BLIND = {
-    "single": ("air", range(0, 20, 4)),
-    "mosaic": ("sphere", range(4)),
-    "outside": ("sphere", range(0, 9, 4)),
+    "single": ("air", range(0, 20, 8)),
+    "mosaic": ("sphere", range(0, 4, 2)),
+    "outside": ("sphere", range(0, 9, 8)),
     "none": ("sphere", range(1000, 1001)),
 }
 
