@@ -10,16 +10,14 @@ blocked answers.
 
 from __future__ import annotations
 
-import contextlib
-from functools import partial
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from drivers.clock import Clock
 from drivers.errors import DeviceError, WrongDevice
-from drivers.prompt_line import PromptLine, prompt_framer
-from drivers.serial_link import LineRegistry, SerialLink, Transcript
+from drivers.prompt_line import PromptLine
+from drivers.serial_link import LineRegistry, SerialLink
+from drivers.shuttered_source import ShutteredSource, open_beside
 from drivers.source import LightSource, check_wavelengths
 from drivers.sources import sc10
 
@@ -52,15 +50,14 @@ class Config(BaseModel):
         return self
 
 
-class FilterWheel(LightSource):
+class FilterWheel(ShutteredSource):
     """A wheel with a filter for each wavelength."""
 
     selects_wavelength = True
 
     def __init__(self, config: Config, link: SerialLink, shutter: LightSource | None, lines: LineRegistry) -> None:
+        super().__init__(config.port, shutter, lines)
         self.config = config
-        self._lines = lines
-        self._shutter = shutter
         self._name = f"filter wheel on {config.port}"
         self._line = PromptLine(link, self._name, config.reply_s)
         self._model = self._line.ask("*idn?")
@@ -108,23 +105,11 @@ class FilterWheel(LightSource):
             return self._shutter.is_on()
         return self._line.ask_number("pos?") != self.config.dark_position
 
-    def interlock_open(self) -> bool:
-        """That of the shutter; a wheel alone has none."""
-        return self._shutter is not None and self._shutter.interlock_open()
-
     def describe(self) -> dict[str, str]:
         """Kind, model, port, and the filters by position."""
         filters = ", ".join(f"{position}: {nm:g} nm" for nm, position in self.config.positions.items())
         found = {"kind": self.config.kind, "model": self._model, "port": self.config.port, "filters": filters}
-        if self._shutter is not None:
-            found["shutter"] = self._shutter.describe()["model"]
-        return found
-
-    def close(self) -> None:
-        """Give the ports back; wheel and shutter stay as they are."""
-        if self._shutter is not None:
-            self._shutter.close()
-        self._lines.release(self.config.port)
+        return self._with_shutter(found)
 
     def _turn(self, position: int) -> None:
         if self._line.ask_number("pos?") == position:
@@ -142,18 +127,4 @@ class FilterWheel(LightSource):
 
 def open(config: Config, lines: LineRegistry) -> FilterWheel:
     """Open the wheel, and the shutter where there is one; asks who they are and changes nothing."""
-    with (
-        lines.taken(config.port, SerialLink, partial(_link, config, lines.clock)) as link,
-        contextlib.ExitStack() as failed,
-    ):
-        shutter: LightSource | None = None
-        if config.shutter is not None:
-            shutter = sc10.open(config.shutter, lines)
-            failed.callback(shutter.close)
-        wheel = FilterWheel(config, link, shutter, lines)
-        failed.pop_all()
-        return wheel
-
-
-def _link(config: Config, clock: Clock, transcript: Transcript | None) -> SerialLink:
-    return SerialLink(config.port, BAUDRATE, prompt_framer, transcript=transcript, clock=clock, held_by=config.held_by)
+    return open_beside(FilterWheel, config, lines, BAUDRATE)

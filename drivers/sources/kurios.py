@@ -10,17 +10,15 @@ the number of ``OM=1`` (manual), which is that of a public program.
 
 from __future__ import annotations
 
-import contextlib
 import re
-from functools import partial
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from drivers.clock import Clock
 from drivers.errors import DeviceError, WrongDevice
-from drivers.prompt_line import PromptLine, prompt_framer
-from drivers.serial_link import LineRegistry, SerialLink, Transcript
+from drivers.prompt_line import PromptLine
+from drivers.serial_link import LineRegistry, SerialLink
+from drivers.shuttered_source import ShutteredSource, open_beside
 from drivers.source import LightSource
 from drivers.sources import sc10
 
@@ -47,15 +45,14 @@ class Config(BaseModel):
     settle_s: float = Field(default=0.3, ge=0, description="time that the liquid crystals take after a change")
 
 
-class TunableFilter(LightSource):
+class TunableFilter(ShutteredSource):
     """A filter between lamp and sample."""
 
     selects_wavelength = True
 
     def __init__(self, config: Config, link: SerialLink, shutter: LightSource | None, lines: LineRegistry) -> None:
-        self.config = config
-        self._link, self._lines = link, lines
-        self._shutter = shutter
+        super().__init__(config.port, shutter, lines)
+        self.config, self._link = config, link
         self._name = f"tunable filter on {config.port}"
         self._line = PromptLine(link, self._name, config.reply_s, echo=False)
         self._model = self._line.ask("*idn?")
@@ -118,38 +115,12 @@ class TunableFilter(LightSource):
         open_ = self._shutter is None or self._shutter.is_on()
         return open_ and self._value("BW") != BLACK
 
-    def interlock_open(self) -> bool:
-        """That of the shutter; a filter alone has none."""
-        return self._shutter is not None and self._shutter.interlock_open()
-
     def describe(self) -> dict[str, str]:
         """Kind, model, port and band."""
         found = {"kind": self.config.kind, "model": self._model, "port": self.config.port, "band": self.config.band}
-        if self._shutter is not None:
-            found["shutter"] = self._shutter.describe()["model"]
-        return found
-
-    def close(self) -> None:
-        """Give the ports back; filter and shutter stay as they are."""
-        if self._shutter is not None:
-            self._shutter.close()
-        self._lines.release(self.config.port)
+        return self._with_shutter(found)
 
 
 def open(config: Config, lines: LineRegistry) -> TunableFilter:
     """Open the filter, and the shutter where there is one; asks who they are and changes nothing."""
-    with (
-        lines.taken(config.port, SerialLink, partial(_link, config, lines.clock)) as link,
-        contextlib.ExitStack() as failed,
-    ):
-        shutter: LightSource | None = None
-        if config.shutter is not None:
-            shutter = sc10.open(config.shutter, lines)
-            failed.callback(shutter.close)
-        source = TunableFilter(config, link, shutter, lines)
-        failed.pop_all()
-        return source
-
-
-def _link(config: Config, clock: Clock, transcript: Transcript | None) -> SerialLink:
-    return SerialLink(config.port, BAUDRATE, prompt_framer, transcript=transcript, clock=clock, held_by=config.held_by)
+    return open_beside(TunableFilter, config, lines, BAUDRATE)

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from processing.arrays import Array, ComplexArray
 from processing.geometry.frames import ScatteringGeometry
+from processing.section import Section
 from processing.yaml_file import ConfigError, load_yaml
 
 ENTRY_POINT_GROUP = "umov.reflectance"
@@ -34,6 +35,27 @@ class ReflectanceModel(Protocol):
     def mueller_jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> Array:
         """Mueller-Jones matrices (..., 4, 4) with element 00 equal to 1."""
         ...
+
+
+class Material(Section):
+    """What every material file of this folder states; each kind adds `kind` and the type of its constants."""
+
+    name: str = Field(description="name that messages and other files use")
+    source: str | None = Field(default=None, description="where the constants come from")
+    constants: dict[float, Any] = Field(description="optical constants for each wavelength in nm")
+
+    @property
+    def wavelengths_nm(self) -> tuple[float, ...]:
+        """Wavelengths at which the material is given."""
+        return tuple(self.constants)
+
+    def jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> ComplexArray:
+        """Jones matrices (..., 2, 2)."""
+        raise NotImplementedError
+
+    def mueller_jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> Array:
+        """Mueller-Jones matrices (..., 4, 4), element 00 equal to 1."""
+        return normalized_mueller(self.jones(geometry, wavelength_nm))
 
 
 class _Header(BaseModel):

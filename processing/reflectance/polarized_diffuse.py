@@ -7,10 +7,10 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from processing.arrays import Array, ComplexArray
+from processing.arrays import ComplexArray
 from processing.geometry.frames import ScatteringGeometry
 from processing.reflectance import fresnel
-from processing.reflectance.base import constants_at, normalized_mueller
+from processing.reflectance.base import Material, constants_at
 from processing.section import Section
 
 
@@ -33,25 +33,14 @@ def diffuse_jones(geometry: ScatteringGeometry) -> ComplexArray:
     return out
 
 
-class Model(Section):
+class Model(Material):
     """J = F + a sin^b(theta_h) S."""
 
     kind: Literal["polarized_diffuse"] = "polarized_diffuse"
-    name: str = Field(description="name that messages and other files use")
-    source: str | None = Field(default=None, description="where the constants come from")
     constants: dict[float, Constants] = Field(description="optical constants for each wavelength in nm")
-
-    @property
-    def wavelengths_nm(self) -> tuple[float, ...]:
-        """Wavelengths at which the material is given."""
-        return tuple(self.constants)
 
     def jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> ComplexArray:
         """Jones matrices (..., 2, 2)."""
         c: Constants = constants_at(self.constants, wavelength_nm, self.name)
         weight = c.a * np.sin(geometry.angles.theta_h) ** c.b
         return fresnel.jones(geometry, complex(c.n, c.k)) + weight[..., None, None] * diffuse_jones(geometry)
-
-    def mueller_jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> Array:
-        """Mueller-Jones matrices (..., 4, 4), element 00 equal to 1."""
-        return normalized_mueller(self.jones(geometry, wavelength_nm))

@@ -16,7 +16,7 @@ from processing.geometry.frames import ScatteringGeometry, cross, dot, unit
 from processing.polarization import mueller
 from processing.polarization.cloude import xi0_and_dominant
 from processing.reflectance import fresnel
-from processing.reflectance.base import constants_at, normalized_mueller
+from processing.reflectance.base import Material, constants_at, normalized_mueller
 from processing.section import Section
 
 
@@ -28,18 +28,11 @@ class Constants(Section):
     albedo: float = Field(ge=0, le=1, description="part of the light in the volume that comes back")
 
 
-class Model(Section):
+class Model(Material):
     """Sum of a rough first surface and of a depolarizing volume under it."""
 
     kind: Literal["rough_plastic"] = "rough_plastic"
-    name: str = Field(description="name that messages and other files use")
-    source: str | None = Field(default=None, description="where the constants come from")
     constants: dict[float, Constants] = Field(description="optical constants for each wavelength in nm")
-
-    @property
-    def wavelengths_nm(self) -> tuple[float, ...]:
-        """Wavelengths at which the material is given."""
-        return tuple(self.constants)
 
     def brdf(self, geometry: ScatteringGeometry, wavelength_nm: float) -> Array:
         """Mueller matrices (..., 4, 4) of both processes, in 1/sr; zero below the surface."""

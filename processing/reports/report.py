@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
+from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -91,11 +92,15 @@ def write_report(
 ) -> Path:
     """Write one self-contained HTML file about captures, products, CSV tables and pictures.
 
+    A report of the same sources under the same title is made again without `overwrite`.
+
     Raises
     ------
     ProcessError : nothing to report, `out` exists, or simulated and measured data are mixed.
     """
-    require_place(out, overwrite)
+    asked = sha256("\0".join([title, *map(os.path.realpath, sources)]).encode()).hexdigest()
+    mark = f"<!-- umov report {asked} -->\n"
+    require_place(out, overwrite or _begins_with(out, mark))
     files = [f for f in collect(sources) if os.path.realpath(f) != os.path.realpath(out)]
     simulated = _kind_of_data(files)
     sections: list[ReportSection] = []
@@ -111,8 +116,15 @@ def write_report(
         if progress:
             progress(count, len(files))
     made = f"Made by umov {version('umov')} on {datetime.now(UTC).isoformat(timespec='seconds')}, {len(files)} files."
-    write_whole_text(out, render(title, simulated, made, sections))
+    write_whole_text(out, mark + render(title, simulated, made, sections))
     return out
+
+
+def _begins_with(path: Path, text: str) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(text)) == text.encode()
 
 
 def _section(path: Path) -> ReportSection:

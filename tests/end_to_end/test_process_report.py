@@ -65,6 +65,8 @@ def test_report_is_self_contained(campaign: Path, capsys: pytest.CaptureFixture[
     assert re.search(r"uncertainty budget of depolarization_index = (1\.000|0\.999)\d*", text)
     assert "noise of light and camera" in text
     assert "U95 = " in text
+    # The same command again makes it anew; another report is not replaced.
+    assert run(capsys, "report", campaign, "--out", out, "--title", "Air & co") == (0, "")
     code, err = run(capsys, "report", campaign, "--out", out)
     assert code == 2
     assert "exists" in err
