@@ -18,7 +18,8 @@ from processing.geometry.viewing import ViewingGeometry
 from processing.maps.stokes_vector import moves_of_light
 from processing.reduction.sent_light import light_of, sent_parts, sent_rows
 from processing.reduction.systematic import Systematic
-from processing.reflectance.material_fit import MaterialFit, fit_values
+from processing.reflectance.fitted_constants import MaterialFit
+from processing.reflectance.material_fit import fit_values
 from processing.reflectance.plastic_fit import fit_plastic
 from processing.storage.products.images import SMALLEST, MuellerImage, StokesImage
 from processing.storage.products.product import Product

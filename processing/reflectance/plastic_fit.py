@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike
 
 from processing.arrays import Array
 from processing.geometry.frames import ScatteringGeometry
-from processing.reflectance.material_fit import MaterialFit, Ranges, evenly, result_of, search, unexplained
+from processing.reflectance.fitted_constants import MaterialFit, Ranges, evenly, result_of, search, unexplained
 from processing.reflectance.rough_plastic import processes
 
 PLASTIC = Ranges(
+    kind="rough_plastic",
     names=("n", "alpha", "albedo"),
     lower=np.array([1.01, 0.02, 0.0]),
     upper=np.array([4.0, 1.0, 1.0]),
@@ -65,6 +66,5 @@ def fit_plastic(
         free=left.size - len(left) - 3,
         method="sum of two processes",
         off=np.array(off).reshape(-1, 3),
-        kind="rough_plastic",
         of=PLASTIC,
     )

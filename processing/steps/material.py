@@ -7,7 +7,7 @@ from pathlib import Path
 
 from processing.doors import require_place
 from processing.maps.material_fit import fit_products
-from processing.reflectance.material_fit import MaterialFit
+from processing.reflectance.fitted_constants import MaterialFit
 from processing.steps.file_step import OfFiles
 from processing.steps.maps import geometry_identities
 from processing.storage.products.provenance import Step, file_identity, input_text

@@ -14,7 +14,8 @@ from processing.maps.material_fit import covariance_by_light, determined_values
 from processing.polarization.cloude import xi0_and_dominant
 from processing.polarization.mueller import coherency, coherency_to_mueller
 from processing.reduction.sent_light import sent_rows
-from processing.reflectance.material_fit import DIFFUSE, MaterialFit, fit_values
+from processing.reflectance.fitted_constants import MaterialFit
+from processing.reflectance.material_fit import DIFFUSE, fit_values
 from simulators.bench.scene import Scene
 
 NAMES = DIFFUSE.names
