@@ -90,7 +90,13 @@ def _in_our_words(error: TyperException) -> str:
         wanted = wrong["msg"].removeprefix("Input should be ").partition(", unable")[0]
         explained = f" ({parameter.help})" if getattr(parameter, "help", None) else ""
         said = f"{name} {wrong['input']}: must be {wanted}{explained}"
-    return f"error: {said}" + ("" if context is None else f"; {context.command_path} -h tells more")
+    if context is None:
+        return f"error: {said}"
+    # As the user started this program: `UMOV_DOOR` is set by ./lab.
+    words = context.command_path.split()
+    if words[0] == "umov":
+        words[0] = os.environ.get("UMOV_DOOR", "umov")
+    return f"error: {said}; {' '.join(words)} -h tells more"
 
 
 def application(name: str, text: str) -> Application:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import fcntl
 import hashlib
 import os
 import random
@@ -353,6 +354,13 @@ def main() -> None:
     """Run one of the five."""
     which, numbers = sys.argv[1], [int(text) for text in sys.argv[2:]]
     if "LD_PRELOAD" not in os.environ:
+        # Two at once would read each other's records. The lock goes on into the program that takes this one's place.
+        lock = os.open(f"{WORK}.lock", os.O_CREAT | os.O_RDWR, 0o600)
+        os.set_inheritable(lock, True)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise SystemExit(f"another run uses {WORK}. Wait for its end.") from None
         if not GO_ON:
             shutil.rmtree(WORK, ignore_errors=True)
         (WORK / "captures").mkdir(parents=True, exist_ok=True)
