@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from processing.commands.batch import Made, files_of, run_batch
+from processing.commands.batch import Made, files_of, place_for, run_batch
 from processing.commands.purposes import DATA
-from processing.commands.recipe import keep_recipe, read_recipe
+from processing.commands.recipe import read_recipe, recipe_text
+from processing.errors import ProcessError
+from processing.whole_file import write_whole_text
 
 if TYPE_CHECKING:
     from processing.steps.file_step import Progress
@@ -32,6 +35,13 @@ def register(app: typer.Typer) -> None:
 def import_command(
     context: typer.Context,
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength of the measurement.")],
+    items: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Measurements with these options, a capture of each: stacks in place of --stack, or what {item} "
+            "stands for in --stack, --states, --columns and --darks."
+        ),
+    ] = None,
     states: Annotated[
         Path | None,
         typer.Option(
@@ -69,14 +79,14 @@ def import_command(
     read_noise_e: Annotated[float | None, typer.Option(help="Read noise in electrons.")] = None,
     bits: Annotated[int | None, typer.Option(help="Bits of the counts; default: of the file's type.")] = None,
     title: Annotated[str, typer.Option(help="Title to keep in the file.")] = "",
-    out: Annotated[Path | None, typer.Option(help="Capture to write; default: states file's name with .h5.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Capture to write; default: states file's name with .h5. Of several ITEMS: a folder."),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a capture of that name.")] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the states as understood, draw the frames, write no capture.")
     ] = False,
-    each: Annotated[
-        bool | None, typer.Option("--each", help="Each frame is a scene of its own: a capture for each; --out: folder.")
-    ] = None,
     recipe: Annotated[
         Path | None,
         typer.Option(
@@ -86,16 +96,22 @@ def import_command(
         ),
     ] = None,
 ) -> None:
-    """Make a capture out of frames or fluxes measured elsewhere. One row of states.csv is one state.
+    """Make captures out of frames or fluxes measured elsewhere. One row of states.csv is one state.
 
-    The options are kept beside the capture in NAME.import.yaml, for `--recipe`.
+    The options are kept beside the capture in NAME.import.yaml, for `--recipe`. A capture that is newer than its data
+    and was made with the same options is not made again.
     """
     from processing.commands.loaded_late.import_preview import show_understood
-    from processing.commands.progress_bar import progress_bar
-    from processing.storage.captures.capture import Capture
     from processing.storage.captures.schema import Detector
     from processing.storage.formats.foreign_arrays import ImportFailed
-    from processing.storage.formats.importing import ImportRequest, import_capture, read_sample, scenes_of
+    from processing.storage.formats.importing import (
+        ImportRequest,
+        for_item,
+        import_capture,
+        is_imported,
+        name_of_item,
+        read_sample,
+    )
 
     if gain_e_per_count is not None and gain_e_per_count <= 0:
         raise ImportFailed(f"--gain-e-per-count {gain_e_per_count:g}: must be above 0")
@@ -121,32 +137,47 @@ def import_command(
         darks=darks,
         repeats=repeats,
     )
-    scenes = scenes_of(request, out) if each else [request]
+    requests = {first: request}
+    if items:
+        place = place_for([Path(item) for item in items], out)
+        requests = {
+            Path(item): replace(for_item(request, item), out=place(name_of_item(item))) for item in dict.fromkeys(items)
+        }
     if dry_run:
-        show_understood(scenes[0])
+        for one in requests.values():
+            show_understood(one)
         return
-    if each:
-        by_file = {Path(str(scene.stack)): scene for scene in scenes}
+    sources: dict[Path, Path] = {}
 
-        def make(frame: Path, tick: Progress) -> Made:
-            scene = by_file[frame]
-            is_newer = scene.out.exists() and scene.out.stat().st_mtime > frame.stat().st_mtime
-            if overwrite or not is_newer:
-                import_capture(scene, tick)
-            return Made((scene.out,), is_newer and not overwrite)
+    def make(item: Path, tick: Progress) -> Made:
+        one = requests[item]
+        if (other := sources.setdefault(one.out, item)) != item:
+            raise ProcessError(f"its capture {one.out} is that of {other} too. Import one of them with another --out.")
+        kept, text = one.out.with_suffix(".import.yaml"), recipe_text(context, one)
+        is_same = kept.is_file() and kept.read_text(encoding="utf-8", errors="replace") == text
+        if is_same and not overwrite and is_imported(one):
+            return Made((one.out,), True)
+        import_capture(one, tick)
+        write_whole_text(kept, text)
+        return Made((one.out,), False)
 
-        typer.echo(f"recipe: {keep_recipe(context, scenes[0].out.parent / 'each.h5')}")
-        run_batch("importing", "states", list(by_file), make)
-        return
-    with progress_bar("importing", "states") as tick:
-        header = import_capture(request, tick)
-    recipe_file = keep_recipe(context, request.out)
-    typer.echo(f"{request.out}: {header.title}, {header.wavelength_nm:g} nm, sample {header.sample.kind}")
-    with Capture(request.out) as capture:
+    run_batch("importing", "states", list(requests), make, _print_imported)
+
+
+def _print_imported(made: Made) -> None:
+    from processing.storage.captures.capture import Capture
+
+    (path,) = made.paths
+    with Capture(path) as capture:
+        header = capture.header
         count = 0 if capture.angles_deg else capture.states_with("sample").size
+    typer.echo(f"{path}: {header.title}, {header.wavelength_nm:g} nm, sample {header.sample.kind}")
     if count > 1:
-        typer.echo(f"{count} frames in which nothing turns: `reduce` averages them. If each is a scene, add --each")
-    typer.echo(f"recipe: {recipe_file}")
+        typer.echo(
+            f"{count} frames in which nothing turns: `reduce` averages them. If each is a scene, give the files "
+            "themselves in place of --stack"
+        )
+    typer.echo(f"recipe: {path.with_suffix('.import.yaml')}")
 
 
 def _name_and_column(text: str) -> tuple[str, str]:

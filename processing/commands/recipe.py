@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
 from processing.section import Section
-from processing.whole_file import write_whole_text
 from processing.yaml_file import dump_yaml, load_yaml
+
+if TYPE_CHECKING:
+    from processing.storage.formats.importing import ImportRequest
 
 
 class ImportRecipe(Section):
@@ -29,7 +31,6 @@ class ImportRecipe(Section):
     read_noise_e: float | None = None
     bits: int | None = None
     repeats: int | None = None
-    each: bool | None = None
 
 
 def read_recipe(context: typer.Context, path: Path | None) -> Path | None:
@@ -39,10 +40,10 @@ def read_recipe(context: typer.Context, path: Path | None) -> Path | None:
     return path
 
 
-def keep_recipe(context: typer.Context, out: Path) -> Path:
-    """Write the options of this run beside its capture; returns NAME.import.yaml."""
-    given = {name: context.params[name] for name in ImportRecipe.model_fields if context.params[name] is not None}
+def recipe_text(context: typer.Context, request: ImportRequest) -> str:
+    """The options of this run as a recipe, with the files of one request."""
+    names = {**context.params, "states": request.states, "stack": request.stack, "darks": request.darks}
+    names["columns"] = [f"{name}={column}" for name, column in request.columns.items()] or None
+    given = {name: names[name] for name in ImportRecipe.model_fields if names[name] is not None}
     texts = {name: str(value) if isinstance(value, Path) else value for name, value in given.items()}
-    path = out.with_suffix(".import.yaml")
-    write_whole_text(path, dump_yaml(ImportRecipe.model_validate(texts)))
-    return path
+    return dump_yaml(ImportRecipe.model_validate(texts))

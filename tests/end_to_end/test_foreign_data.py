@@ -136,18 +136,88 @@ def test_other_files_of_the_same_scan(configs, tmp_path, process, drr, kind, mon
 
 
 def test_scenes_of_a_polarization_camera_are_not_averaged(configs, tmp_path, process):
-    for k in range(3):
-        cv2.imwrite(str(tmp_path / f"scene{k}.png"), np.full((8, 8), 1000 + k, np.uint16))
-    camera = configs / "instruments" / "linear_stokes.yaml"
-    command = ("import", "--stack", tmp_path, "--wavelength-nm", 550, "--instrument", camera)
-    _, said, _ = process(*command, "--out", tmp_path / "all.h5")
-    assert "3 frames in which nothing turns: `reduce` averages them. If each is a scene, add --each" in said
-    code, said, _ = process(*command, "--each", "--out", tmp_path / "each")
+    scenes = [tmp_path / f"scene{k}.png" for k in range(3)]
+    for k, scene in enumerate(scenes):
+        cv2.imwrite(str(scene), np.full((8, 8), 1000 + k, np.uint16))
+    given = ("--wavelength-nm", 550, "--instrument", configs / "instruments" / "linear_stokes.yaml")
+    _, said, _ = process("import", "--stack", tmp_path, *given, "--out", tmp_path / "all.h5")
+    assert "3 frames in which nothing turns: `reduce` averages them. If each is a scene, give the files" in said
+    code, said, _ = process("import", *scenes, *given, "--out", tmp_path / "each")
     assert (code, said.splitlines()[-1]) == (0, "3 inputs: 3 made, 0 unchanged, 0 failed")
     with Capture(tmp_path / "each" / "scene2.h5") as capture:
         assert capture.frames(0)[0, 0, 0] == 1002
-    again = process("import", "--recipe", tmp_path / "each" / "each.import.yaml", "--out", tmp_path / "each")
-    assert again[1].splitlines()[-1] == "3 inputs: 0 made, 3 unchanged, 0 failed"
+
+
+@pytest.fixture
+def day(configs, tmp_path, drr, monkeypatch):
+    """Folders of three measurements, each with frames and a table; returns the options of them all."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("run_2", "run_10", "run_3.5"):
+        Path(name).mkdir()
+        np.save(f"{name}/frames.npy", frames_of(configs, "drr_5to1.yaml", drr)[:, 0] - DARK)
+        table = np.stack([drr["psg"], drr["psa"]], axis=1)
+        np.savetxt(f"{name}/log.csv", table, delimiter=",", header="psg,psa", comments="")
+    instrument = configs / "instruments" / "drr_5to1.yaml"
+    return ("--wavelength-nm", 532, "--instrument", instrument)
+
+
+def test_several_measurements_in_one_command(day, process):
+    runs = sorted(Path().glob("run_*"))
+    options = ("--states", "{item}/log.csv", "--stack", "{item}/frames.npy", *day)
+    (runs[0] / "log.csv").rename("away.csv")
+    code, said, errors = process("import", *options, *runs, "none")
+    assert code == 2
+    assert "4 inputs: 2 made, 0 unchanged, 2 failed" in said
+    assert f"{runs[0]}/log.csv: cannot be read" in errors
+    Path("away.csv").rename(runs[0] / "log.csv")
+    made = [Path(f"{run}.h5") for run in runs]
+    before = [path.stat().st_mtime_ns for path in made[1:]]
+    code, said, _ = process("import", *options, *runs)
+    assert (code, said.splitlines()[-1]) == (0, "3 inputs: 1 made, 2 unchanged, 0 failed")
+    assert [path.stat().st_mtime_ns for path in made[1:]] == before
+    for path in made:
+        assert mueller_of(process, path) == pytest.approx(SAMPLE, abs=2e-3)
+    # Another option, or newer frames, are another capture.
+    assert process("import", *options, "--black-level", 5, *runs)[0] == 2
+    np.save(runs[0] / "frames.npy", np.load(runs[0] / "frames.npy") + 1)
+    code, said, errors = process("import", *options, *runs)
+    assert (code, said.splitlines()[-1]) == (2, "3 inputs: 0 made, 2 unchanged, 1 failed")
+    assert f"{made[0]} exists" in errors
+
+
+def test_the_stack_of_a_recipe_is_that_of_no_other_measurement(day, process):
+    runs = sorted(Path().glob("run_*"))
+    np.save(runs[1] / "frames.npy", np.load(runs[1] / "frames.npy") + 7)
+    stack = runs[0] / "frames.npy"
+    assert process("import", "--states", runs[0] / "log.csv", "--stack", stack, *day, "--out", "first.h5")[0] == 0
+    (runs[1] / "frames.npy.csv").write_bytes((runs[1] / "log.csv").read_bytes())
+    given = ("--recipe", "first.import.yaml", runs[1] / "frames.npy")
+    for more in ((), ("--states", "{item}.csv")):
+        code, _, errors = process("import", *given, *more, "--out", "second.h5", "--overwrite")
+        assert code == 0, errors
+        with Capture(Path("first.h5")) as first, Capture(Path("second.h5")) as second:
+            assert np.array_equal(first.frames(4) + 7, second.frames(4))
+
+
+def test_the_data_are_never_replaced_by_their_capture(configs, tmp_path, process, drr):
+    file = tmp_path / "lab.h5"
+    with h5py.File(file, "w") as h5:
+        h5["frames"] = frames_of(configs, "drr_5to1.yaml", drr)[:, 0]
+        h5["angles"] = np.stack([drr["psg"], drr["psa"]], axis=1)
+    whole = file.read_bytes()
+    columns = (
+        "--columns",
+        "psg={item}::/angles[0]",
+        "--columns",
+        "psa={item}::/angles[1]",
+        "--stack",
+        "{item}::/frames",
+    )
+    given = (*columns, "--wavelength-nm", 532, "--instrument", configs / "instruments" / "drr_5to1.yaml", file)
+    code, _, said = process("import", *given, "--overwrite")
+    assert (code, "has the data themselves" in said) == (2, True)
+    assert file.read_bytes() == whole
+    assert process("import", *given, "--out", tmp_path / "capture.h5")[0] == 0
 
 
 def test_two_beams_on_one_sensor(tmp_path, process):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -21,6 +22,7 @@ from processing.computing.threads import thread_count
 from processing.doors import one_line, read_text, require_picture, require_place, require_room
 from processing.instrument.measured import NUMBER
 from processing.instrument.model import InstrumentModel
+from processing.storage.captures.capture import Capture
 from processing.storage.captures.frame_layout import Beams
 from processing.storage.captures.nexus import attach
 from processing.storage.captures.schema import CaptureHeader, Detector, Sample, create_layout, write_closing
@@ -36,6 +38,9 @@ Progress = Callable[[int, int], None]
 
 Frame = NDArray[Any]
 
+#: What stands for each of several measurements in the options of an import.
+ITEM = "{item}"
+
 #: Most bytes of a file of 16 numbers.
 MOST_SAMPLE_BYTES = 1 << 16
 
@@ -44,7 +49,7 @@ MOST_SAMPLE_BYTES = 1 << 16
 class FrameSource:
     """Frames of all states, whatever they come from: shape (channels, rows, columns), type, and an iterator.
 
-    `names` has the file of each frame, where there are files.
+    `names` has the file of each frame, where there are files, and `files` where they are.
     """
 
     shape: tuple[int, int, int]
@@ -52,6 +57,7 @@ class FrameSource:
     frames: Callable[[], Iterator[Frame]]
     channels: tuple[str, ...]
     names: tuple[str, ...] = ()
+    files: tuple[Path, ...] = ()
 
 
 #: A file, and a page of it where it has several.
@@ -138,19 +144,52 @@ def understand(request: ImportRequest) -> Understood:
     return Understood(states, source, model)
 
 
-def scenes_of(request: ImportRequest, out: Path | None) -> list[ImportRequest]:
-    """A request for each frame of a folder or a pattern, into a folder: `out`, or that of the frames.
+def for_item(request: ImportRequest, item: str) -> ImportRequest:
+    """The request for one of several measurements: `item` replaces `{item}`, and a stack without `{item}`."""
 
-    Raises
-    ------
-    ImportFailed : the frames are no files of one frame each.
-    """
-    found = frame_files(request.stack or "")
-    if found is None or request.states is not None:
-        raise ImportFailed("--each takes frames that are files: --stack FOLDER or a pattern such as 'run/*.png'")
-    folder = out or found.files[0].parent
-    folder.mkdir(parents=True, exist_ok=True)
-    return [replace(request, stack=str(file), out=folder / f"{file.stem}.h5") for file in found.files]
+    def of_item(text: str) -> str:
+        return text.replace(ITEM, item)
+
+    columns = {name: of_item(column) for name, column in request.columns.items()}
+    has_own_table = columns != request.columns or ITEM in str(request.states)
+    stack = request.stack or ("" if has_own_table else ITEM)
+    return replace(
+        request,
+        states=request.states and Path(of_item(str(request.states))),
+        stack=(of_item(stack) if ITEM in stack else item) if stack else None,
+        darks=request.darks and of_item(request.darks),
+        columns=columns,
+    )
+
+
+def name_of_item(item: str) -> Path:
+    """The usual capture of one of several measurements: NAME.h5 next to it, NAME_DATASET.h5 for `NAME.h5::/dataset`."""
+    file, _, inside = item.partition("::")
+    path = Path(file)
+    stem = path.name if path.is_dir() else path.stem
+    return path.with_name("_".join([stem, *re.findall(r"\w+", inside)]) + ".h5")
+
+
+def is_imported(request: ImportRequest) -> bool:
+    """Whether the capture has this sample and title, and is newer than all of its data. Raises as `understand`."""
+    if not request.out.is_file():
+        return False
+    with Capture(request.out) as capture:
+        header = capture.header
+    if header.sample != request.sample or request.title not in ("", header.title):
+        return False
+    made = request.out.stat().st_mtime_ns
+    return all(file.stat().st_mtime_ns < made for file in _files_of(request, understand(request)))
+
+
+def _files_of(request: ImportRequest, understood: Understood) -> list[Path]:
+    """Files that a capture is made of."""
+    texts = (request.stack, request.darks, request.states, request.instrument, *request.columns.values())
+    files = [*understood.source.files]
+    for text in map(str, filter(None, texts)):
+        found = frame_files(text) if text == request.darks else None
+        files += found.files if found else [Path(re.split(r"::|\[\d+\]$", text)[0])]
+    return [file for file in files if file.is_file()]
 
 
 def _places(stack: str | None, found: FrameFiles | None) -> tuple[Place, ...]:
@@ -234,6 +273,8 @@ def import_capture(request: ImportRequest, progress: Progress | None = None) -> 
     """
     require_place(request.out, request.overwrite, captures_too=True)
     understood = understand(request)
+    if request.out.exists() and any(request.out.samefile(file) for file in _files_of(request, understood)):
+        raise ImportFailed(f"{request.out}: has the data themselves, and is not replaced. Give another --out.")
     states, source, model = understood.states, understood.source, understood.model
     detector = request.detector
     if detector.bits is None and source.dtype.kind == "u":
@@ -375,7 +416,7 @@ def _images(states: StatesFile, places: tuple[Place, ...], names: tuple[str, ...
                 yield frame
 
     shown = tuple(file.name if page is None else f"{file.name}[{page}]" for file, page in places)
-    return FrameSource((1, *first.shape), first.dtype, frames, names, shown)
+    return FrameSource((1, *first.shape), first.dtype, frames, names, shown, tuple(file for file, _ in places))
 
 
 def _with_darks(text: str, states: StatesFile, source: FrameSource) -> tuple[StatesFile, FrameSource]:
