@@ -157,7 +157,10 @@ def test_an_error_has_two_digits_and_its_value_ends_with_it(client, browser, add
 def test_a_browser_keeps_a_region_and_finds_it_on_another_capture(lab, drr_capture, address, browser, draw_region):
     Reduction(drr_capture("one.h5")).make()
     drr_capture("two.h5", seed_of_noise=2)
-    page = browser.new_page(viewport={"width": 1400, "height": 900})
+    context = browser.new_context(
+        permissions=["clipboard-read", "clipboard-write"], viewport={"width": 1400, "height": 900}
+    )
+    page = context.new_page()
     page.set_default_timeout(60_000)
     expect.set_options(timeout=60_000)
     wrong = []
@@ -176,6 +179,18 @@ def test_a_browser_keeps_a_region_and_finds_it_on_another_capture(lab, drr_captu
     # Two digits of error, and the value ends where it does.
     mean = page.locator("#region-table tr").nth(1).locator("td").nth(3)
     expect(mean).to_have_text(re.compile(r"^0\.\d+ ± 0\.0*[1-9]\d$"))
+    # What is copied is the table, tabs between its columns, as a spreadsheet takes it.
+    page.evaluate("navigator.clipboard.writeText('before')")
+    page.locator("#regions-copy").click()
+    expect(page.locator("#regions-told")).to_have_text("copied")
+    table = [
+        [cell.inner_text() for cell in row.locator("td, th").all()[:6]]
+        for row in page.locator("#region-table tr").all()
+    ]
+    copied = [line.split("\t") for line in page.evaluate("navigator.clipboard.readText()").splitlines()]
+    assert copied == table
+    assert [line[0] for line in copied] == ["region", "spot"]
     page.locator("#region-table").get_by_role("button", name="Remove spot").click()
     page.locator("#region-table").get_by_text("spot").wait_for(state="detached")
     assert wrong == []
+    context.close()

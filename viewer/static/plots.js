@@ -36,6 +36,14 @@ export function pressed(button, act) {
   button.disabled = false;
 }
 
+/** A button that copies lines of cells as a spreadsheet takes them, and says so. */
+export const copies = (button, lines, told, problem) => pressed(button, async () => {
+  try {
+    await navigator.clipboard.writeText(lines().map(line => line.join("\t")).join("\n"));
+    told.textContent = "copied";
+  } catch (error) { say(problem, error); }
+});
+
 export function say(where, error) {
   const line = document.createElement("p");
   line.className = "error";

@@ -1,6 +1,6 @@
 // Named regions of an image: marked in it, measured in a table, and compared by histogram and profile.
 
-import { accent, at, bad, byId, draw, ink, measured, newestJson, post, pressed, quiet, say, warn } from "./plots.js";
+import { accent, at, bad, byId, copies, draw, ink, measured, newestJson, post, quiet, say, warn } from "./plots.js";
 
 const HEADS = ["region", "columns", "rows", "mean", "spread", "pixels"];
 const COLOURS = [accent, warn, ink, bad, quiet];
@@ -25,8 +25,7 @@ export class Regions {
     });
     form.querySelector("button").disabled = false;
     byId("regions-csv").href = at("regions.csv", { file });
-    pressed(byId("regions-copy"), () => this.run(() => navigator.clipboard.writeText(
-      [[...HEADS, this.rows[0]?.unit ?? ""], ...this.rows.map(row => this.texts(row))].map(line => line.join("\t")).join("\n"))));
+    copies(byId("regions-copy"), () => [this.heads(), ...this.rows.map(row => this.texts(row))], byId("regions-told"), byId("regions-problem"));
     byId("along").addEventListener("change", () => this.plots());
   }
 
@@ -57,8 +56,12 @@ export class Regions {
     return [row.name || "chosen", range(row.x0, row.x1), range(row.y0, row.y1), mean, spread, row.pixels];
   }
 
-  table() {
+  heads() {
     const unit = this.rows[0]?.unit;
+    return HEADS.map(text => (unit && /mean|spread/.test(text) ? `${text} / ${unit}` : text));
+  }
+
+  table() {
     const head = document.createElement("tr"), lines = this.rows.map(row => {
       const line = document.createElement("tr"), last = document.createElement("td");
       line.append(...this.texts(row).map(text => cell(text)));
@@ -71,9 +74,10 @@ export class Regions {
       line.append(last);
       return line;
     });
-    head.append(...HEADS.map(text => cell(unit && /mean|spread/.test(text) ? `${text} / ${unit}` : text, "th")), cell(""));
+    head.append(...this.heads().map(text => cell(text, "th")), cell(""));
     byId("region-table").replaceChildren(head, ...lines);
     byId("regions-measured").hidden = !this.rows.length;
+    byId("regions-told").textContent = "";
   }
 
   plots() {

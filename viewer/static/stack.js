@@ -1,6 +1,6 @@
 // A region followed through the products of a folder: a curve for each sample, wavelength and arm angle.
 
-import { accent, at, bad, byId, draw, embedded, ink, measured, newestJson, pressed, quiet, say, warn } from "./plots.js";
+import { accent, at, bad, byId, copies, draw, embedded, ink, measured, newestJson, quiet, say, warn } from "./plots.js";
 
 const spec = embedded("spec"), read = newestJson();
 const COLOURS = [accent, warn, ink, bad, quiet], SYMBOLS = ["circle", "square", "diamond", "cross", "triangle-up"];
@@ -93,7 +93,6 @@ async function refresh() {
 if (byId("of")) {
   for (const name of ["of", "where"]) byId(name).addEventListener("change", refresh);
   byId("over").addEventListener("change", plot);
-  pressed(byId("stack-copy"), () => navigator.clipboard.writeText([heads(), ...points.map(texts)].map(line => line.join("\t")).join("\n"))
-    .then(() => { byId("told").textContent = "copied"; }, error => say(byId("stack-problem"), error)));
+  copies(byId("stack-copy"), () => [heads(), ...points.map(texts)], byId("told"), byId("stack-problem"));
   addEventListener("load", async () => { await refresh(); document.body.dataset.ready = "yes"; });
 }
