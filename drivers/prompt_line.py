@@ -72,6 +72,8 @@ class PromptLine:
     def _exchange(self, text: str, reply_s: float, form: re.Pattern[str] | None = None) -> str:
         asked = f"{self._name}, {text}"
         with self._link.lock:
+            # What waits here was not asked for now.
+            self._link.purge(0.0)
             self._link.write(text.encode("ascii") + b"\r")
             frame = self._link.read_frame(self._link.clock.now_s() + reply_s)
         if frame is None:

@@ -195,16 +195,22 @@ class ElliptecAxis(SessionReferenceAxis):
 
     def _find(self) -> tuple[str, str]:
         config, line = self.config, self._line
-        found = {}
-        for address in config.address or "0123456789ABCDEF":
-            try:
-                found[address] = agreed(partial(line.ask, address, "in", "IN", 30, tries=2 if config.address else 1))
-            except ReplyTimeout:
-                if config.address is not None:
-                    raise
+        found: dict[str, str] = {}
+        for _ in range(2):
+            for address in config.address or "0123456789ABCDEF":
+                try:
+                    found[address] = agreed(
+                        partial(line.ask, address, "in", "IN", 30, tries=2 if config.address else 1)
+                    )
+                except ReplyTimeout:
+                    if config.address is not None:
+                        raise
+            wanted = [item for item in found.items() if config.serial_number in (None, item[1][2:10])]
+            # An answer can be late: while the module is missing, all are asked again.
+            if wanted:
+                break
         asked = f"axis {self.name}, find Elliptec module on {config.port}"
         listed = ", ".join(f"address {address}: serial {info[2:10]}" for address, info in found.items()) or "none"
-        wanted = [item for item in found.items() if config.serial_number in (None, item[1][2:10])]
         if len(wanted) != 1:
             rule = f"address {config.address}, serial_number {config.serial_number}"
             raise WrongDevice(asked, f"{len(wanted)} modules match {rule}; found {listed}", "Correct the rig file")

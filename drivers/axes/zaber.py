@@ -145,9 +145,7 @@ class ZaberLine:
         CommandRejected, ReplyTimeout, ReplyError
         """
         with self.link.lock:
-            reply, seen = self._exchange(address, axis, words)
-            if reply is None and repeat:
-                reply, seen = self._exchange(address, axis, words)
+            reply, seen = self._exchange(address, axis, words, tries=2 if repeat else 1)
         asked = f"Zaber {self.link.port} device {address}, {words or 'status'!r}"
         if reply is None and seen:
             raise ReplyError(
@@ -161,35 +159,40 @@ class ZaberLine:
             raise CommandRejected(asked, f"rejected: {reply.data}", "Check the state of the device and the command")
         return reply
 
-    def _exchange(self, address: int, axis: int, words: str) -> tuple[Reply | None, list[bytes]]:
+    def _exchange(self, address: int, axis: int, words: str, tries: int) -> tuple[Reply | None, list[bytes]]:
         seen: list[bytes] = []
-        message_id = self.send(address, axis, words)
-        deadline_s = self.link.clock.now_s() + self.reply_s
-        while (frame := self.link.read_frame(deadline_s)) is not None:
-            reply = parse_reply(frame)
-            if (
-                reply is not None
-                and (reply.address, reply.axis, reply.message_id) == (address, axis, message_id)
-                and (reply.summed or address in self._unsummed)
-            ):
-                return reply, seen
-            # Alerts (!), extra info (#), late replies and noise.
-            seen.append(frame)
-        self.link.purge()
+        for _ in range(tries):
+            message_id = self.send(address, axis, words)
+            deadline_s = self.link.clock.now_s() + self.reply_s
+            while (frame := self.link.read_frame(deadline_s)) is not None:
+                reply = parse_reply(frame)
+                if (
+                    reply is not None
+                    and (reply.address, reply.axis, reply.message_id) == (address, axis, message_id)
+                    and (reply.summed or address in self._unsummed)
+                ):
+                    return reply, seen
+                # Alerts (!), extra info (#), late replies and noise.
+                seen.append(frame)
+            self.link.purge()
         return None, seen
 
-    def ask_all(self, words: str, quiet_s: float = 0.1) -> list[Reply]:
-        """Ask every device on the chain and collect the replies until the line is quiet."""
+    def ask_all(self, words: str, quiet_s: float = 0.1) -> list[tuple[int, str]]:
+        """Ask every device on the chain; returns addresses and data of the replies until the line is quiet."""
         replies: list[Reply] = []
         with self.link.lock:
             message_id = self.send(0, 0, words)
             deadline_s = self.link.clock.now_s() + self.reply_s
             while (frame := self.link.read_frame(deadline_s)) is not None:
                 reply = parse_reply(frame)
-                if reply is not None and reply.message_id == message_id:
+                if reply is not None and reply.message_id == message_id and reply.accepted:
                     replies.append(reply)
                     deadline_s = self.link.clock.now_s() + quiet_s
-            return [reply for reply in replies if reply.summed or self._sends_no_checksums(reply.address)]
+            return sorted(
+                (reply.address, reply.data)
+                for reply in replies
+                if reply.summed or self._sends_no_checksums(reply.address)
+            )
 
     def _sends_no_checksums(self, address: int) -> bool:
         """True if the device itself says so, twice; its replies are believed without from then on.
@@ -198,7 +201,7 @@ class ZaberLine:
         """
         if address not in self._unsummed:
             self._unsummed.add(address)
-            settings = [self._exchange(address, 0, "get comm.checksum")[0] for _ in range(2)]
+            settings = [self._exchange(address, 0, "get comm.checksum", tries=2)[0] for _ in range(2)]
             if not all(reply is not None and _says_no_checksums(reply) for reply in settings):
                 self._unsummed.discard(address)
         return address in self._unsummed
@@ -242,17 +245,17 @@ class ZaberAxis(MotionAxis):
     def _find(self) -> tuple[int, str]:
         """Return address and serial number of the device that the rig file means."""
         config = self.config
-        serials = self._line.ask_all("get system.serial") or self._line.ask_all("get system.serial")
-        found = {reply.address: reply.data for reply in serials if reply.accepted}
-        listed = ", ".join(f"address {address}: serial {serial}" for address, serial in sorted(found.items()))
+        # An answer can be late: the chain is as long as it was the last time.
+        found = agreed(lambda: self._line.ask_all("get system.serial"))
+        listed = ", ".join(f"address {address}: serial {serial}" for address, serial in found)
         asked = f"axis {self.name}, find Zaber device on {config.port}"
         if not found:
             raise ReplyTimeout(asked, "no device answers", "Check power, cable and that the chain speaks Zaber ASCII")
-        if len(found) < len(serials):
+        if len({address for address, _ in found}) < len(found):
             raise WrongDevice(asked, f"two devices have one address ({listed})", "Renumber the chain")
         wanted = [
             (address, serial)
-            for address, serial in sorted(found.items())
+            for address, serial in found
             if config.address in (None, address) and str(config.serial_number or serial) == serial
         ]
         if len(wanted) != 1:

@@ -13,14 +13,16 @@ box: the exact text of `E?`, and the number format of `BP?`, which the adapter r
 from __future__ import annotations
 
 import re
+from functools import partial
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers.clock import Clock
-from drivers.errors import CommandRejected, DeviceError, ReplyError, ReplyTimeout, WrongDevice
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
+from drivers.errors import CommandRejected, DeviceError, ReplyError, WrongDevice
+from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
 from drivers.source import LightSource, check_wavelengths
+from drivers.unmarked_replies import ask, text_of
 
 BAUDRATE = 115200
 MODELS = ("DC4100", "DC4104")
@@ -28,6 +30,8 @@ BRIGHTNESS_MODE = 1
 SUPPLY_FAILS, TOO_HOT = 1 << 1, 1 << 3
 # LEDs carry a nominal wavelength that can be some nm off the measured one.
 _NEAR_NM = 15.0
+_LINE = re.compile(r".*")
+_NUMBER = re.compile(r"[+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?")
 
 
 def missing_led(channel: int) -> int:
@@ -72,14 +76,15 @@ class Dc4100(LightSource):
     def __init__(self, config: Config, link: SerialLink, lines: LineRegistry) -> None:
         self.config = config
         self._link, self._lines = link, lines
-        self._model = self._ask("N?")
+        self._model, self._serial_number, self._firmware = (
+            agreed(partial(self._ask, query)) for query in ("N?", "S?", "V?")
+        )
         if self._model not in MODELS:
             raise WrongDevice(
                 f"identify the LED driver on {config.port}",
                 f"it answers {self._model!r}, which is none of {', '.join(MODELS)}",
                 "Correct `source` in the rig file",
             )
-        self._serial_number, self._firmware = self._ask("S?"), self._ask("V?")
         status = self._status()
         self._present = [channel for channel in range(4) if not status & missing_led(channel)]
         self._nominal_nm = {channel: self._number(f"WL? {channel}") for channel in self._present}
@@ -226,27 +231,17 @@ class Dc4100(LightSource):
         raise self._garbled(query, " ".join(answers))
 
     def _number(self, query: str) -> float:
-        for _ in range(2):
-            answer = self._ask(query)
-            try:
-                return float(answer)
-            except ValueError:
-                self._link.purge()
-        raise self._garbled(query, answer)
+        return float(agreed(lambda: self._ask(query, _NUMBER)))
 
-    def _ask(self, query: str) -> str:
-        """One query; without a reply it is asked once more, after the line has been quiet."""
-        with self._link.lock:
-            for _ in range(2):
-                self._link.write(query.encode("ascii") + b"\r\n")
-                frame = self._link.read_frame(self._link.clock.now_s() + self.config.reply_s)
-                if frame is not None:
-                    return frame.decode("ascii", "replace").strip()
-                self._link.purge()
-        raise ReplyTimeout(
-            f"LED driver on {self.config.port}, {query}",
-            f"no reply in {self.config.reply_s:g} s, twice",
-            "Check power and cable, and that the port is that of the LED driver",
+    def _ask(self, query: str, form: re.Pattern[str] = _LINE) -> str:
+        """One query; without a reply of the form it is asked once more, after the line has been quiet."""
+        return ask(
+            self._link,
+            query.encode("ascii") + b"\r\n",
+            text_of(form),
+            self.config.reply_s,
+            asked=f"LED driver on {self.config.port}, {query}",
+            what_to_check="Check power and cable, and that the port is that of the LED driver",
         )
 
     def _tell(self, command: str) -> None:

@@ -17,7 +17,7 @@ from simulators.clock import FastClock, patient_clock
 from simulators.rig.controller_kinds import served_kinds, source_configs
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
-from simulators.serial.reply_faults import parse_fault
+from simulators.serial.reply_faults import Fault, parse_fault
 from simulators.serial.serve_options import ServeOptions
 
 
@@ -31,9 +31,9 @@ class ServedSource:
     config: BaseModel
     wavelength_nm: float
 
-    def open(self) -> LightSource:
+    def open(self, reply_s: float = 0.2) -> LightSource:
         """Open it with a short wait for replies and choose the wavelength, where it has a choice."""
-        known = {"reply_s": 0.2} if "reply_s" in type(self.config).model_fields else {}
+        known = {"reply_s": reply_s} if "reply_s" in type(self.config).model_fields else {}
         source = open_source(self.config.model_copy(update=known), self.lines)
         if source.selects_wavelength:
             source.select(self.wavelength_nm)
@@ -100,6 +100,18 @@ class SourceConformance:
         assert described["kind"] == served.config.kind  # type: ignore[attr-defined]
         assert described["port"] == served.port.path
         assert described["model"]
+
+    @pytest.mark.parametrize("late_s", [0.16, 0.22])
+    def test_one_late_answer_spoils_no_opening(self, served: ServedSource, late_s: float) -> None:
+        """On a busy machine: one answer behind the wait for it, at every place of the opening."""
+        found = served.open().describe()
+        commands = served.emulator.faults.commands
+        served.lines.close()
+        for place in range(1, commands + 1):
+            served.emulator.faults.add(Fault("late", from_command=place, commands=1, amount=late_s))
+            assert served.open(reply_s=0.1).describe() == found
+            served.emulator.faults.clear()
+            served.lines.close()
 
     def test_a_silent_device_is_an_error_in_bounded_time(self, served: ServedSource) -> None:
         source = served.open()

@@ -9,9 +9,11 @@ from drivers.axes import apt, elliptec, esp301, gcs2, gsc, owis, smc100, zaber
 from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
 from drivers.serial_link import LONGEST_FRAME, LineRegistry, line_framer
 from simulators.clock import FastClock, patient_clock
+from simulators.controllers import elliptec as elliptec_emulator
 from simulators.controllers import esp301 as esp301_emulator
 from simulators.controllers import zaber as zaber_emulator
 from simulators.serial.pty_port import PtyPort
+from simulators.serial.reply_faults import Fault
 from simulators.serial.serve_options import ServeOptions
 from tests.protocol.scripted import scripted
 
@@ -321,6 +323,17 @@ def test_framers_take_any_bytes_and_keep_little(pieces: list[bytes]) -> None:
         assert len(buffer) <= longest
 
 
+def test_a_module_that_answers_late_is_found_by_its_serial_number() -> None:
+    emulator = elliptec_emulator.make(ServeOptions(clock=FastClock(100.0, base=patient_clock())))
+    serial_number = elliptec_emulator.axis_configs(emulator, "none")[0].serial_number
+    # Of the two readings of its identity the first or the second.
+    for place in (1, 2):
+        with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
+            emulator.faults.add(Fault("late", from_command=place, commands=1, amount=0.13))
+            config = elliptec.Config(port=port.path, serial_number=serial_number, reply_s=0.1)
+            assert elliptec.open("psg", config, lines).describe().serial_number == serial_number
+
+
 def test_elliptec_end_message_just_before_the_status_still_proves_the_homing() -> None:
     # The module's end of homing arrives between the question for its status and the answer to it.
     pairs = elliptec_after(
@@ -378,7 +391,7 @@ def test_zaber_replies_without_checksum_count_where_the_device_says_that_it_send
         (b"/" + summed("1 1 05 get pos") + b"\n", b"@01 1 05 OK IDLE -- -77:00\r\n"),
     ) as path:
         line = zaber.ZaberLine(zaber.Config(port=path, reply_s=0.2), patient_clock(), None)
-        assert [reply.data for reply in line.ask_all("get system.serial")] == ["4711"]
+        assert line.ask_all("get system.serial") == [(1, "4711")]
         assert line.ask(1, 1, "get pos", repeat=False).data == "-77"
         with pytest.raises(ReplyError):
             line.ask(1, 1, "get pos", repeat=False)

@@ -12,14 +12,14 @@ from tests.protocol.scripted import scripted
 
 # Status 0xA80: no LED at channels 2, 3 and 4, so one LED is driven.
 OPENING = [
-    (b"N?\r\n", b"DC4100\r\n"),
-    (b"S?\r\n", b"M00223344\r\n"),
-    (b"V?\r\n", b"1.4.0\r\n"),
-    (b"R?\r\n", b"2688\r\n"),
-    (b"WL? 0\r\n", b"660.0\r\n"),
+    *[(b"N?\r\n", b"DC4100\r\n")] * 2,
+    *[(b"S?\r\n", b"M00223344\r\n")] * 2,
+    *[(b"V?\r\n", b"1.4.0\r\n")] * 2,
+    *[(b"R?\r\n", b"2688\r\n")] * 2,
+    *[(b"WL? 0\r\n", b"660.0\r\n")] * 2,
     *[(b"O? 0\r\n", b"0\r\n")] * 2,
 ]
-# There is no checksum, so what decides about light is asked twice.
+# There is no checksum, so constants and what decides about light are asked twice.
 OFF, ON = [("O? 0", "0")] * 2, [("O? 0", "1")] * 2
 
 
@@ -43,11 +43,19 @@ def opened(path: str, lines: LineRegistry) -> dc4100.Dc4100:
         (lambda source: source.is_on(), ON),
         (
             lambda source: (source.select(662.0), source.set_level(40.0)),
-            [*OFF, *[("M?", "1")] * 2, ("BP 0 40", ""), ("BP? 0", "40.0")],
+            [*OFF, *[("M?", "1")] * 2, ("BP 0 40", ""), *[("BP? 0", "40.0")] * 2],
         ),
         (
             lambda source: (source.select(662.0), source.set_level(12.5)),
-            [*OFF, *[("M?", "0")] * 2, *OFF, ("M 1", ""), *[("M?", "1")] * 2, ("BP 0 12.5", ""), ("BP? 0", "13")],
+            [
+                *OFF,
+                *[("M?", "0")] * 2,
+                *OFF,
+                ("M 1", ""),
+                *[("M?", "1")] * 2,
+                ("BP 0 12.5", ""),
+                *[("BP? 0", "13")] * 2,
+            ],
         ),
     ],
 )
@@ -58,7 +66,7 @@ def test_each_call_sends_these_lines_and_no_others(action, pairs) -> None:  # ty
 
 def test_a_refusal_is_explained_by_status_and_error() -> None:
     # Status 0xA88: too hot.
-    pairs = [*OFF, ("O 0 1", ""), *OFF, ("R?", "2696"), ("E?", "ERROR 4:over temperature")]
+    pairs = [*OFF, ("O 0 1", ""), *OFF, *[("R?", "2696")] * 2, ("E?", "ERROR 4:over temperature")]
     told = pytest.raises(CommandRejected, match=r"LED 1 on: .*too hot.*error 4 over temperature")
     with scripted(*wire(pairs)) as path, LineRegistry(clock=patient_clock()) as lines, told:
         opened(path, lines).set_light(True)
