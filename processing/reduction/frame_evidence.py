@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
-from scipy.special import stdtrit
+from scipy.special import digamma, polygamma, stdtrit
 
 from processing.arrays import Array
 from processing.storage.captures.capture import Capture
@@ -37,6 +37,8 @@ LEAST_CHANGE = 0.03
 MIRRORED_LEAVES, LEAST_PATTERN = 0.25, 0.01
 #: How often a capture may have a sound state that is called mirrored.
 MIRRORED_BY_CHANCE = 1e-3
+#: Most degrees of freedom that cosines lend to each other.
+MOST_FREEDOM = 1000.0
 #: Part of the power of a cosine of the picture that noise may be: noise alone reaches a tenth once in a million (F with
 #: 16 and 23 degrees of freedom).
 NOISE_SHARE = 0.1
@@ -281,8 +283,8 @@ def _mirrored_alone(rows: Array, blocks: Array) -> tuple[int, str] | None:
     """The state whose picture has the odd part of its prediction with the opposite sign, and how; None without one.
 
     Mirroring changes the part of a picture that is odd under it, and nothing else. The others predict that part. How
-    far the state's own part stays behind its prediction is held against the residuals of the others: Student's t. Each
-    cosine of the picture counts by the part of its power that is not noise (Wiener).
+    far the state's own part stays behind its prediction is held against the residuals of the others: Student's t, with
+    a variance that all odd cosines share. Each counts by the part of its power that is not noise (Wiener).
     """
     n, best = len(rows), (np.inf, 0, "")
     cosines = dctn(blocks, axes=(1, 2), norm="ortho").reshape(n, -1)
@@ -304,10 +306,12 @@ def _mirrored_alone(rows: Array, blocks: Array) -> tuple[int, str] | None:
         noise_share = noise * unknowns / (n - 1) / np.maximum(power, np.finfo(float).tiny)
         share = np.where(noise_share < NOISE_SHARE, 1 - noise_share, 0.0)
         predicted = weights @ cosines[others]
-        limit = stdtrit(freedom, MIRRORED_BY_CHANCE / (n * len(MIRRORS)))
         for mask in odd.values():
             pattern = np.where(mask, share * predicted, 0.0)
-            spread = np.square(residual @ pattern).sum() / freedom * (1 + weights @ weights)
+            common, lent = _common_variance(noise[mask], freedom)
+            spread = np.square(residual @ pattern).sum() + lent * common * (pattern @ pattern)
+            spread *= (1 + weights @ weights) / (freedom + lent)
+            limit = stdtrit(freedom + lent, MIRRORED_BY_CHANCE / (n * len(MIRRORS)))
             agreement = float(cosines[k] @ pattern)
             # The noise of the prediction agrees with itself.
             expected = float(predicted @ pattern) - float(share[mask] @ noise[mask]) * (weights @ weights)
@@ -319,6 +323,19 @@ def _mirrored_alone(rows: Array, blocks: Array) -> tuple[int, str] | None:
                 # Mirroring turns the sign of the odd cosines.
                 best = beyond, k, min(odd, key=lambda words: float((cosines[k] * predicted) @ odd[words]))
     return best[1:] if best[2] else None
+
+
+def _common_variance(variances: Array, freedom: int) -> tuple[float, float]:
+    """The variance that estimates with `freedom` degrees of freedom each have in common, and its degrees of freedom.
+
+    The less their logarithms scatter beyond chance, the more each learns from all (Smyth, Stat. Appl. Genet. Mol. Biol.
+    3, 3, 2004).
+    """
+    logs = np.log(np.maximum(variances, np.finfo(float).tiny)) - digamma(freedom / 2) + np.log(freedom / 2)
+    excess = float(logs.var(ddof=1) - polygamma(1, freedom / 2))
+    # The inverse of the trigamma function, to 10 %.
+    half = min(1 / excess + 0.5, MOST_FREEDOM / 2) if excess > 0 else MOST_FREEDOM / 2
+    return float(np.exp(logs.mean() + digamma(half) - np.log(half))), 2 * half
 
 
 def evidence_of(capture: Capture) -> tuple[str, ...]:

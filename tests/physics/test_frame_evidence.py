@@ -96,15 +96,15 @@ def test_a_picture_upside_down_of_a_nearly_symmetric_sample_is_named_where_its_o
 
 
 def test_noise_does_not_hide_a_smooth_odd_part(rows):
-    """With all cosines of the picture alike, and against a prediction of zero, 3 of these 24 were named."""
+    """With the noise of each pattern from its own 23 degrees of freedom, 42 of these 96 were named."""
     named = 0
-    for seed in range(24):
+    for seed in range(96):
         blocks, state = nearly_symmetric(rows, seed, odd=1e-3, wander=0.0), (7 * seed + 3) % STATES
         blocks[state] = blocks[state][::-1]
         found = [f.state for f in mirrored_pictures(np.arange(STATES), rows, blocks)]
         assert found in ([state], [])
         named += len(found)
-    assert named >= 10
+    assert named >= 46
 
 
 @pytest.mark.parametrize("odd", [0.0, 1e-3])
