@@ -1,23 +1,36 @@
-"""What honest error bars cost: xi0 and all quantities beside the same with first-order error bars alone."""
+"""What honest error bars cost: xi0 and all quantities with first-order error bars alone, a table without any."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
-from measuring import Task, seconds
+from measuring import SMALL, Task, seconds
 from noisy_images import five_samples, noisy_image
+from reduction_tasks import INSTRUMENT, ROOT, frames_of_a_ball, write_frames
 
-from processing.maps import quantities
+from processing.instrument.model import InstrumentModel
+from processing.maps import quantities, tables
 from processing.maps.xi0 import eigenvalue_block
 from processing.polarization import gradients
 from processing.polarization.quantities import PAPER_PAIRS
+from processing.reduction.mueller import reduce_mueller
+from processing.reflectance.tables import ScatteringTable
+from processing.steps.table import Tabulation
+from processing.storage.captures.capture import Capture
 from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import Step
 
 PIXELS = 40_000
 #: Honest error bars may take this much longer.
 AT_MOST = 1.3
+#: Of a table: what is uncertain in the instrument, in degrees.
+U = {
+    **{f"{end}_retarder.retardance_deg": 0.3 for end in ("psg", "psa")},
+    **{f"{end}.azimuth_deg": 0.1 for end in ("psg_retarder", "psa_retarder", "analyzer")},
+}
 
 
 def _image() -> MuellerImage:
@@ -56,4 +69,26 @@ def all_quantities() -> Task:
     )
     task.peers["first order alone"] = lambda: seconds(first_order)
     task.at_most = ("first order alone", AT_MOST)
+    return task
+
+
+def table(folder: Path) -> Task:
+    """`process table`, file to file: noise and five uncertain inputs of the instrument beside means and variances."""
+    write_frames(folder / "ball.h5", SMALL, frames_of_a_ball, omega_deg=35.0)
+    model = InstrumentModel.load(INSTRUMENT).at(662).model_copy(update={"stderr": U})
+    image = folder / "ball.mueller.h5"
+    with Capture(folder / "ball.h5") as capture:
+        reduce_mueller(capture, model, image, (Step("reduce", {}),))
+    geometry = ROOT / "configs/geometries/one_inch_sphere.yaml"
+    step = Tabulation((image,), geometry, folder / "table.h5", "renderer")
+
+    def means() -> None:
+        alone = ScatteringTable(tables.MUELLER, 662, "renderer", True, frames="renderer")
+        with mock.patch.object(tables, "_table_for", return_value=alone):
+            step.make(overwrite=True)
+
+    name = f"process table with noise and {len(U)} uncertain inputs, {SMALL[0]} x {SMALL[1]}"
+    task = Task(name, None, lambda: step.make(overwrite=True))
+    task.peers["means and variances alone"] = lambda: seconds(means)
+    task.at_most = ("means and variances alone", AT_MOST)
     return task

@@ -60,7 +60,10 @@ def frames_of_a_ball(shape: tuple[int, int], states: int) -> list[np.ndarray]:
 
 
 def write_frames(
-    path: Path, shape: tuple[int, int], taken: Callable[[tuple[int, int], int], list[np.ndarray]] = some_frames
+    path: Path,
+    shape: tuple[int, int],
+    taken: Callable[[tuple[int, int], int], list[np.ndarray]] = some_frames,
+    omega_deg: float | None = None,
 ) -> tuple[float, float]:
     """A capture of 40 states through the writer of `acquire`; seconds to create it and to fill it."""
     table = rotating_retarders(0.01)
@@ -69,6 +72,7 @@ def write_frames(
         simulated=True,
         mode="drr",
         wavelength_nm=662,
+        omega_deg=omega_deg,
         sample=Sample(kind="unknown"),
         detector=Detector(black_level_counts=50, gain_e_per_count=2.6, read_noise_e=2.3, full_well_e=1e6, bits=16),
         instrument_yaml=INSTRUMENT.read_text(encoding="utf-8"),

@@ -52,6 +52,7 @@ def tasks(peers: PeerProcess | None, folder: Path) -> list[tuple[str, Callable[[
         ("lu-chipman", lambda: image.polar(SMALL, 20, peers)),
         ("error bars, xi0", error_bars.xi0),
         ("error bars, quantities", error_bars.all_quantities),
+        ("error bars, table", lambda: error_bars.table(folder)),
         ("mosaic", lambda: image.mosaic(LARGE, 12, peers)),
         ("xi0", lambda: reflectance.xi0(10)),
         ("table", lambda: reflectance.table(60)),

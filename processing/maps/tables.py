@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations_with_replacement
 from pathlib import Path
 
@@ -13,14 +13,13 @@ from processing.arrays import Array
 from processing.errors import ProcessError
 from processing.geometry.frames import GeometryImage, frame_turns
 from processing.geometry.viewing import ViewingGeometry
-from processing.maps.intervals import moves_of
 from processing.maps.white_reference import SCALE, WhiteReference
 from processing.reduction.mueller import Progress
 from processing.reduction.systematic import INPUTS, Systematic
 from processing.reflectance.pbsdf import MUELLER
 from processing.reflectance.shared_noise import shared_variance
 from processing.reflectance.table_axes import Layout
-from processing.reflectance.tables import ScatteringTable
+from processing.reflectance.tables import BinGroups, ScatteringTable
 from processing.storage.products.images import MuellerImage, require_all_elements
 from processing.storage.products.images import neighbour_correlation as noise_between
 from processing.storage.products.product import Product
@@ -62,31 +61,44 @@ def _xi0_values(table: ScatteringTable, image: GeometryImage, product: Product) 
     return values
 
 
-def _mueller_values(
+def _add_mueller(
     table: ScatteringTable, image: GeometryImage, product: Product, *, rows: slice, white: WhiteReference | None
-) -> Array:
-    """Values (planes, N) of a table from some rows of a Mueller product, turned into the renderer's axes."""
+) -> None:
+    """Add some rows of a Mueller product to a table, turned into the renderer's axes.
+
+    Uncertainties are those of the mean pixel of each bin: it moves and is turned like the others of its bin.
+    """
     block = MuellerImage.of(product, rows).at(np.flatnonzero(image.mask))
     left, right = (np.ascontiguousarray(np.moveaxis(m, 0, -1)) for m in frame_turns(image.points, image.points.half))
-    # What each element (second) adds to each turned one (first), (N,).
-    share = {(k, i): left[k // 4, i // 4] * right[i % 4, k % 4] for g in _MIXED for k in g for i in g}
     factor = np.ones(left.shape[-1]) if white is None else white.factor(product, image)
-    values = factor * _turned(block.values.reshape(1, 16, -1), share)
-    parts = [values]
+    values = factor * _turned(block.values.reshape(16, -1), _shares(left, right))
     if table.has_noise:
-        parts.append(np.square(factor) * _turned_variance(block, share)[None])
-    if table.inputs and (systematic := Systematic.of_product(product)) is not None:
-        parts.append(factor * _turned(moves_of(systematic, block)[..., 0], share))
-    if white is not None:
-        parts.append(white.u * values)
-    return np.concatenate(parts).reshape(table.planes, -1)
+        values[:, ~np.isfinite(block.errors.reshape(16, -1).sum(axis=0))] = np.nan
+
+    def uncertainty(groups: BinGroups) -> Iterator[Array]:
+        pixels, turns = block.averaged(groups.mean), _shares(groups.mean(left), groups.mean(right))
+        scale = groups.mean(factor)
+        if table.has_noise:
+            yield np.square(scale) * _turned_variance(pixels, turns)
+        if table.inputs and (systematic := Systematic.of_product(product)) is not None:
+            for moved in systematic.moves(pixels.values.reshape(16, -1)):
+                yield scale * _turned(moved, turns)
+        if white is not None:
+            yield white.u * groups.mean(values)
+
+    table.add(image.points.angles, values, product.simulated, uncertainty)
+
+
+def _shares(left: Array, right: Array) -> dict[tuple[int, int], Array]:
+    """What each element (second) adds to each turned one (first), (N,), of turning matrices (4, 4, N)."""
+    return {(k, i): left[k // 4, i // 4] * right[i % 4, k % 4] for g in _MIXED for k in g for i in g}
 
 
 def _turned(values: NDArray[np.floating], share: Mapping[tuple[int, int], Array]) -> Array:
-    """Elements (D, 16, N) in turned axes."""
+    """Elements (16, N) in turned axes."""
     found = np.zeros(values.shape)
     for (k, i), part in share.items():
-        found[:, k] += part * values[:, i]
+        found[k] += part * values[i]
     return found
 
 
@@ -179,10 +191,9 @@ def tabulate(
                 if not image.mask.any():
                     continue
                 if kind == "mueller":
-                    values = _mueller_values(table, image, product, rows=rows, white=white)
+                    _add_mueller(table, image, product, rows=rows, white=white)
                 else:
-                    values = _xi0_values(table, image, product)
-                table.add(image.points.angles, values, product.simulated)
+                    table.add(image.points.angles, _xi0_values(table, image, product), product.simulated)
         if progress:
             progress(done, len(sources))
     if table is None:

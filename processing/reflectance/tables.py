@@ -5,9 +5,9 @@ Sparse in memory and on disc: a capture of a sphere fills few of the three milli
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -21,6 +21,7 @@ from processing.geometry.rusinkiewicz import Angles
 from processing.reflectance.table_axes import SHAPE, Layout, TableAxes
 from processing.storage.captures.nexus import add_group, add_scales, attach, declare, default_plot, describe_light
 from processing.storage.integrity.h5_door import damage_as, mark_of, open_h5, require_dataset, require_group
+from processing.storage.integrity.packed import LEVEL, Packing
 from processing.storage.products.provenance import Step, read_steps, sign, write_steps
 
 #: 1 had everything in the root, without NeXus groups; up to 2 the errors were quantities with names of their own.
@@ -39,6 +40,26 @@ _SUMS = ("sum", "sum_of_squares")
 
 class TableError(ProcessError):
     """A table cannot be made, read or merged as asked."""
+
+
+class BinGroups(NamedTuple):
+    """Samples that were added together, by bin.
+
+    Attributes
+    ----------
+    group : (N,), number of the group of each sample; negative: left out.
+    size : (G,), samples of each group.
+    """
+
+    group: NDArray[np.int32]
+    size: NDArray[np.int64]
+
+    def mean(self, values: NDArray[np.floating]) -> Array:
+        """Means (..., G) over each group of values (..., N)."""
+        flat = np.ascontiguousarray(values.reshape(-1, values.shape[-1]))
+        total, square = (np.zeros((len(flat), self.size.size)) for _ in range(2))
+        _add_sums(self.group, flat, total, square, np.zeros_like(self.size))
+        return np.asarray((total / self.size).reshape(*values.shape[:-1], -1))
 
 
 class ScatteringTable:
@@ -85,10 +106,18 @@ class ScatteringTable:
         self._sum = np.empty((self.planes, 0))
         self._square = np.empty((len(quantities), 0))
 
-    def add(self, angles: Angles, values: ArrayLike, simulated: bool | None = None) -> None:
+    def add(
+        self,
+        angles: Angles,
+        values: ArrayLike,
+        simulated: bool | None = None,
+        uncertainty: Callable[[BinGroups], Iterator[Array]] | None = None,
+    ) -> None:
         """Add samples: angles (...) in radians and values (planes, ...); a sample with any NaN is left out.
 
         The planes are the quantities, with `has_noise` the variance of each, then for each of `inputs` all quantities.
+        All but the quantities may come from `uncertainty` instead: means over the samples of a bin, for all quantities
+        (quantities, groups) at a time.
 
         Raises
         ------
@@ -102,8 +131,10 @@ class ScatteringTable:
             )
         v = np.asarray(values)
         shape = np.shape(angles.theta_h)
-        if v.shape != (self.planes, *shape):
-            raise TableError(f"expected values of shape {(self.planes, *shape)}, got {v.shape}")
+        quantities = len(self.quantities)
+        expected = (self.planes if uncertainty is None else quantities, *shape)
+        if v.shape != expected:
+            raise TableError(f"expected values of shape {expected}, got {v.shape}")
         v = np.ascontiguousarray(v.reshape(len(v), -1))
         if v.dtype not in (np.float32, np.float64):
             v = v.astype(np.float64)
@@ -113,15 +144,17 @@ class ScatteringTable:
         if not np.all(np.isfinite(sums)):
             _drop_unknown(rows, v)
         self._claim(rows)
-        quantities = len(self.quantities)
-        groups, own = (quantities + 3) // 4, v[:quantities]
-        total, square, count = self._sum, self._square, self.count
-        for_ranges(
-            groups, lambda start, stop: _accumulate(rows, own, total, square, count, start, stop), align=1, smallest=1
-        )
-        good = rows >= 0
-        for plane, more in zip(v[quantities:], total[quantities:], strict=True):
-            more += np.bincount(rows[good], plane[good], minlength=count.size)
+        _add_sums(rows, v[:quantities], self._sum, self._square, self.count)
+        samples, further = np.flatnonzero(rows >= 0), self._sum[quantities:]
+        if uncertainty is None:
+            for plane, more in zip(v[quantities:], further, strict=True):
+                more += np.bincount(rows[samples], plane[samples], minlength=self.count.size)
+            return
+        found, of_sample, size = np.unique(rows[samples], return_inverse=True, return_counts=True)
+        group = np.full(rows.size, -1, dtype=np.int32)
+        group[samples] = of_sample
+        for start, means in zip(range(0, len(further), quantities), uncertainty(BinGroups(group, size)), strict=True):
+            further[start : start + quantities, found] += means * size
 
     @property
     def units(self) -> str:
@@ -284,17 +317,24 @@ class ScatteringTable:
             units="",
             long_name="variance of the samples in the bin",
         )
-        for name, text in UNCERTAINTIES.items():
-            if name in self.uncertainties:
-                values = self.uncertainties[name]
-                _put(data, name, values, data, dimensions=("quantity", "bin"), units=self.units, long_name=text)
+        for name, values in self.uncertainties.items():
+            _put(
+                data,
+                name,
+                values.astype(np.float32),
+                data,
+                dimensions=("quantity", "bin"),
+                units=self.units,
+                long_name=UNCERTAINTIES[name],
+            )
         if self.inputs:
             add_scales(data, {"input": len(self.inputs)})
             data["input_name"] = np.array([name.encode() for name in self.inputs], dtype="S")
             attach(data["input_name"], data, ["input"])
             text = "what one standard uncertainty of each uncertain input of the instrument does to the mean"
             dimensions = ("input", "quantity", "bin")
-            _put(data, "directions", self.directions, data, dimensions=dimensions, units="", long_name=text)
+            values = self.directions.astype(np.float32)
+            _put(data, "directions", values, data, dimensions=dimensions, units="", long_name=text)
         default_plot(data, "mean", ("quantity", "bin"), title)
         data["mean"].attrs["coordinates"] = " ".join([*AXES, "count", "quantity_name"])
         for name in (*AXES, "count"):
@@ -372,8 +412,10 @@ def _put(
     units: str,
     long_name: str,
 ) -> None:
-    """Store an array, compressed, its dimensions named by scales."""
-    options: dict[str, Any] = {"compression": "gzip", "shuffle": True} if values.size else {}
+    """Store an array, compressed where that pays, its dimensions named by scales."""
+    options: dict[str, Any] = {}
+    if values.size and Packing.of(np.atleast_2d(values)).is_worth_it:
+        options = {"compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
     dataset = group.create_dataset(name, data=values, **options)
     dataset.attrs.update({"units": units, "long_name": long_name})
     attach(dataset, scales, dimensions)
@@ -419,6 +461,18 @@ def _claim_rows(bins, row_of_bin, used, found):  # type: ignore[no-untyped-def]
             new += 1
         bins[n] = r
     return new
+
+
+def _add_sums(
+    rows: NDArray[np.int32], values: NDArray[np.floating], total: Array, square: Array, count: NDArray[np.int64]
+) -> None:
+    """Add values (Q, N), their squares and their number to the row (Q, rows) of each sample."""
+    for_ranges(
+        (len(values) + 3) // 4,
+        lambda start, stop: _accumulate(rows, values, total, square, count, start, stop),
+        align=1,
+        smallest=1,
+    )
 
 
 @njit(nogil=True, cache=True, fastmath={"contract"})

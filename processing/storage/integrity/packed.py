@@ -57,7 +57,7 @@ class Packing:
 
     @classmethod
     def of(cls, source: h5py.Dataset, byte_worth: float = BYTE_WORTH) -> Packing:
-        """Deflate some strips of a dataset (leading..., rows, columns), byte by byte."""
+        """Deflate some strips of a dataset or an array (leading..., rows, columns), byte by byte."""
         itemsize = source.dtype.itemsize
         blocks = [source[(*place, rows)] for place, rows in _samples(source.shape)]
         size, packed = sum(block.size for block in blocks), np.zeros(itemsize)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.arrays import BoolArray
+from processing.arrays import Array, BoolArray
 from processing.storage.captures.schema import CaptureHeader
 from processing.storage.products.product import Product, ProductError, Step
 
@@ -131,6 +131,24 @@ class MuellerImage:
             mask=pick(self.mask),
             residual_rms=pick(self.residual_rms),
             sent=None if self.sent is None else pick(self.sent),
+        )
+
+    def averaged(self, mean: Callable[[NDArray[np.floating]], Array]) -> Self:
+        """The image of one mean pixel of each group (rows of one); its errors are those of a single pixel.
+
+        Parameters
+        ----------
+        mean : over groups of pixels, from (..., pixels) to (..., groups).
+        """
+
+        def root(values: NDArray[np.floating], *leading: int) -> NDArray[np.float32]:
+            found = np.sqrt(mean(np.square(values.reshape(*leading, -1))))
+            return found.astype(np.float32)[..., None]
+
+        values = mean(self.values.reshape(4, 4, -1)).astype(np.float32)[..., None]
+        mask = np.zeros(values.shape[2:], np.uint8)
+        return replace(
+            self, values=values, errors=root(self.errors, 4, 4), mask=mask, residual_rms=root(self.residual_rms)
         )
 
     @property
