@@ -115,17 +115,20 @@ def _changes(products: list[Path], region: Region) -> list[Changed]:
     return found
 
 
+def comparable(path: Path) -> dict[str, str]:
+    """What two captures that are compared have in common."""
+    with Capture(path) as opened:
+        header, origin = opened.header, "simulated" if opened.simulated else "measured"
+    sample = header.sample.name or header.sample.kind
+    return {"sample": sample, "wavelength": f"{header.wavelength_nm:g} nm", "origin": origin}
+
+
 def _require_alike(capture: Path, reference: Path) -> None:
-    found = []
-    for path in (capture, reference):
-        with Capture(path) as opened:
-            header, origin = opened.header, "simulated" if opened.simulated else "measured"
-        sample = header.sample.name or header.sample.kind
-        found.append({"sample": sample, "wavelength": f"{header.wavelength_nm:g} nm", "origin": origin})
-    for name in found[0]:
-        if found[0][name] != found[1][name]:
+    found, kept = comparable(capture), comparable(reference)
+    for name in found:
+        if found[name] != kept[name]:
             raise ProcessError(
-                f"{capture}: {name} {found[0][name]}, but {reference}: {found[1][name]}. "
+                f"{capture}: {name} {found[name]}, but {reference}: {kept[name]}. "
                 "Give a capture of the same sample as --reference."
             )
 

@@ -35,6 +35,7 @@ def run_batch(
     inputs: Sequence[Path],
     make: Callable[[Path, Progress], Made],
     print_result: Callable[[Made], None] | None = None,
+    word: str = "made",
 ) -> None:
     """Make the files of every input.
 
@@ -49,6 +50,8 @@ def run_batch(
         Files, see `files_of`.
     make
         Makes the files of one input.
+    word
+        What is said of an input that is not unchanged.
 
     Raises
     ------
@@ -65,7 +68,7 @@ def run_batch(
         if made.is_unchanged:
             typer.echo("unchanged: made before of the same inputs with the same options")
         return
-    counts = {"made": 0, "unchanged": 0, "failed": 0}
+    counts = {word: 0, "unchanged": 0, "failed": 0}
     failures: list[str] = []
     worst = 0
     with batch_bar(what, len(inputs)) as bar:
@@ -79,7 +82,7 @@ def run_batch(
                 counts["failed"] += 1
                 bar.finish(f"failed     {text}", failed=True)
                 continue
-            result = "unchanged" if made.is_unchanged else "made"
+            result = "unchanged" if made.is_unchanged else word
             counts[result] += 1
             more = f" and {len(made.paths) - 1} more" if len(made.paths) > 1 else ""
             bar.finish(f"{result:10} {made.paths[0]}{more}{made.facts}")

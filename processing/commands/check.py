@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from processing.commands.batch import Made, files_of, run_batch
 from processing.commands.purposes import CALIBRATION
+
+if TYPE_CHECKING:
+    from processing.campaign.drift import Change
+    from processing.steps.file_step import Progress
 
 
 def register(app: typer.Typer) -> None:
@@ -16,23 +21,59 @@ def register(app: typer.Typer) -> None:
 
 
 def check_command(
-    capture: Annotated[Path, typer.Argument(help="Capture of today: air, or any sample that is kept for the check.")],
+    captures: Annotated[
+        list[Path], typer.Argument(help="Captures of air or of another sample that is kept, or folders of them.")
+    ],
     reference: Annotated[Path, typer.Option(help="Capture of the same sample, taken when the instrument was right.")],
     instrument: Annotated[Path | None, typer.Option(help="Instrument file instead of the one in the captures.")] = None,
     tolerance: Annotated[float, typer.Option(min=0, help="Largest change of M/m00 that counts as unchanged.")] = 0.001,
 ) -> None:
-    """Compare a capture with a kept reference: unchanged, or which elements changed and by what cause.
+    """Compare captures with a kept reference: unchanged, or which elements changed and by what cause.
 
     Each check adds a row to REFERENCE.checks.csv and redraws REFERENCE.checks.png. The exit code is 1 for a change.
     """
-    from processing.campaign.drift import compare, keep
-    from processing.commands.progress_bar import progress_bar
+    from processing.campaign.drift import comparable, compare, keep
     from processing.doors import require_distinct
     from processing.reports.drift_figure import draw_drift
+    from processing.storage.captures.capture import made_of_captures
 
-    require_distinct([capture, reference])
-    with progress_bar("check", "rows") as tick:
-        found = compare(capture, reference, instrument, tolerance, progress=tick)
+    kept = comparable(reference)
+
+    def takes(path: Path) -> bool:
+        return not made_of_captures(path) and comparable(path) == kept and not path.samefile(reference)
+
+    inputs = files_of(captures, takes, f"captures to compare with {reference}")
+    changes: dict[Path, Change] = {}
+
+    def make(capture: Path, tick: Progress) -> Made:
+        require_distinct([capture, reference])
+        change = changes[capture] = compare(capture, reference, instrument, tolerance, progress=tick)
+        one, several = change.largest, len(inputs) > 1
+        table = keep(change, reference)
+        return Made((capture if several else table,), several and not change.count, f"  {one.name} by {one.value:+.2g}")
+
+    def print_result(made: Made) -> None:
+        (change,), (table,) = changes.values(), made.paths
+        _print_change(change, reference, tolerance)
+        typer.echo(f"{table}\n{table.with_suffix('.png')}")
+
+    try:
+        run_batch("check", "rows", inputs, make, print_result, word="changed")
+    finally:
+        if changes:
+            table = reference.with_suffix(".checks.csv")
+            is_simulated = any(change.simulated for change in changes.values())
+            draw_drift(table, table.with_suffix(".png"), reference.name, tolerance, simulated=is_simulated)
+    changed = [path for path, change in changes.items() if change.count]
+    if changed:
+        newest = max(changed, key=lambda path: changes[path].start_time)
+        if len(inputs) > 1:
+            typer.echo(f"newest change: {newest}")
+        _name_cause(newest, reference, instrument)
+        raise typer.Exit(1)
+
+
+def _print_change(found: Change, reference: Path, tolerance: float) -> None:
     if found.simulated:
         typer.echo("SIMULATED data")
     typer.echo(f"{'changed' if found.count else 'unchanged'} since {reference.name}")
@@ -41,12 +82,6 @@ def check_command(
     place = f"rows {rows.start}:{rows.stop}, columns {columns.start}:{columns.stop}"
     typer.echo(f"  largest change over m00: {one.name} by {one.value:+.2g} +- {one.error:.1g} in {place}")
     typer.echo(f"  {found.count} of {found.tests} comparisons beyond noise and the tolerance of {tolerance:g}")
-    table = keep(found, reference)
-    draw_drift(table, table.with_suffix(".png"), reference.name, tolerance, simulated=found.simulated)
-    typer.echo(f"{table}\n{table.with_suffix('.png')}")
-    if found.count:
-        _name_cause(capture, reference, instrument)
-        raise typer.Exit(1)
 
 
 def _name_cause(capture: Path, reference: Path, instrument: Path | None) -> None:

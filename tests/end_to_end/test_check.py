@@ -64,6 +64,24 @@ def test_what_changed_since_is_named_and_kept(air, process):
     assert reference.with_suffix(".checks.png").stat().st_size > 10_000
 
 
+@pytest.mark.long
+def test_a_folder_is_checked_in_one_command(air, process, tmp_path):
+    reference = air("reference", 0.0, 1)
+    for number, turned in enumerate((0.0, 0.5), 1):
+        air(f"day_{number}", turned, 1 + number)
+    air("glass", 0.0, 4, kind="unknown")
+    code, out, err = process("check", tmp_path, "--reference", reference)
+    assert code == 1, err
+    lines = [line.split()[:2] for line in out.splitlines() if line.startswith(("changed", "unchanged"))]
+    assert lines == [["unchanged", f"{tmp_path}/day_1.h5"], ["changed", f"{tmp_path}/day_2.h5"]]
+    assert "2 inputs: 1 changed, 1 unchanged, 0 failed" in out
+    assert "psg_azimuth of psg_retarder" in out[out.index(f"newest change: {tmp_path}/day_2.h5") :]
+    assert reference.with_suffix(".checks.png").exists()
+    # The products that the check made are no captures.
+    assert process("check", tmp_path, tmp_path / "glass.h5", "--reference", reference)[0] == 2
+    assert len(reference.with_suffix(".checks.csv").read_text().splitlines()) == 3
+
+
 def test_another_sample_is_no_check(air, process):
     code, _, err = process("check", air("today", 0, 2, kind="unknown"), "--reference", air("reference", 0, 1))
     assert (code, "sample unknown, but" in err, "--reference" in err) == (2, True, True), err
