@@ -22,9 +22,14 @@ SIOCSIFFLAGS = 0x8914
 IFF_UP = 1
 
 
+#: How many tests marked `long` a run leaves out.
+LEFT_OUT = pytest.StashKey[int]()
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """`--rig FILE` names the rig that tests/hardware may move."""
+    """`--rig FILE` names the rig that tests/hardware may move; `--all` runs the tests marked `long` as well."""
     parser.addoption("--rig", default=None, help="rig file of real hardware for tests/hardware")
+    parser.addoption("--all", action="store_true", help="run the tests marked `long` as well, as CI does")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -40,7 +45,11 @@ def pytest_configure(config: pytest.Config) -> None:
     The simulated camera occupies a fixed port of 127.0.0.1: with a network of their own, parallel test processes do
     not wait for each other's. Needs root; without it the tests run as they are, one process at a time (`./lab test`).
     Real hardware is reached over the real network.
+
+    Whoever selects tests (by a path, -k or -m) gets all that they select.
     """
+    named = config.args_source is pytest.Config.ArgsSource.ARGS
+    config.option.all |= named or bool(config.option.keyword or config.option.markexpr)
     if config.getoption("--rig") is not None:
         return
     if os.geteuid() == 0 and ctypes.CDLL(None, use_errno=True).unshare(CLONE_NEWNET) == 0:
@@ -49,17 +58,22 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let every test process begin with its share of the tests marked `long`.
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the tests marked `long`, or let every test process begin with its share of them.
 
     Each gets an equal number of tests, in the order of `items`; one that has ended takes half of what another has left,
     from the end. A long test there would be the last to run, with nothing beside it.
     """
+    long = [item for item in items if item.get_closest_marker("long")]
+    others = [item for item in items if not item.get_closest_marker("long")]
+    if not config.option.all:
+        config.stash[LEFT_OUT] = len(long)
+        config.hook.pytest_deselected(items=long)
+        items[:] = others
+        return
     processes = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if processes == 1:
         return
-    long = [item for item in items if item.get_closest_marker("long")]
-    others = [item for item in items if not item.get_closest_marker("long")]
     dealt: list[pytest.Item] = []
     for n in range(processes):
         first = long[n::processes]
@@ -67,6 +81,24 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         dealt += first + others[: max(count, 0)]
         del others[: max(count, 0)]
     items[:] = dealt + others
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Let a test process report how many tests it leaves out."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["left_out"] = session.config.stash.get(LEFT_OUT, 0)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Take the number that a test process reports; all of them collect the same tests."""
+    node.config.stash[LEFT_OUT] = getattr(node, "workeroutput", {}).get("left_out", 0)
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """Print how many tests were left out, and how to run them."""
+    if count := config.stash.get(LEFT_OUT, 0):
+        terminalreporter.write_line(f"{count} long tests left out; run them too: ./lab test --all", yellow=True)
 
 
 @pytest.fixture(scope="session")

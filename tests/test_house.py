@@ -3,6 +3,9 @@
 import ast
 import re
 import runpy
+import shutil
+import subprocess
+import sys
 import tomllib
 from fnmatch import fnmatch
 from graphlib import CycleError, TopologicalSorter
@@ -62,6 +65,38 @@ def test_a_circle_would_be_seen(tmp_path):
     (folder / "two.py").write_text("def late():\n    from processing.one import thing\n")
     with pytest.raises(CycleError):
         TopologicalSorter(imports(tmp_path)).prepare()
+
+
+@pytest.fixture
+def two_tests(tmp_path):
+    """Runs pytest over a short and a long test with the tests' own conftest; returns what it prints."""
+    (tmp_path / "pytest.ini").write_text("[pytest]\ntestpaths = tests\nmarkers = long\n")
+    (tmp_path / "tests").mkdir()
+    shutil.copy(ROOT / "tests/conftest.py", tmp_path / "tests")
+    (tmp_path / "tests/test_two.py").write_text(
+        "import pytest\n\ndef test_short(): pass\n\n@pytest.mark.long\ndef test_long(): pass\n"
+    )
+    return lambda *options: (
+        subprocess.run(
+            [sys.executable, "-m", "pytest", "-q", *options], cwd=tmp_path, capture_output=True, text=True
+        ).stdout
+    )
+
+
+@pytest.mark.parametrize("options", [(), ("-n", "2")])
+def test_long_tests_are_left_out_with_a_line(two_tests, options):
+    said = two_tests(*options)
+    assert "1 passed" in said
+    assert "1 long tests left out; run them too: ./lab test --all" in said
+
+
+@pytest.mark.parametrize(
+    "options", [("--all", "-n", "2"), ("tests/test_two.py", "-n", "2"), ("-k", "test"), ("-m", "not other")]
+)
+def test_what_is_selected_runs_although_it_is_long(two_tests, options):
+    said = two_tests(*options)
+    assert "2 passed" in said
+    assert "left out" not in said
 
 
 def test_the_floors_on_the_page_are_those_of_the_contracts():

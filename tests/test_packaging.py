@@ -51,6 +51,7 @@ def test_numpy_is_the_locked_one() -> None:
     assert "dist-packages" not in str(np.__file__)
 
 
+@pytest.mark.long
 def test_the_wheel_works_where_there_is_no_checkout(tmp_path: Path) -> None:
     # From a copy: a build leaves folders behind, and what an earlier one left would get into the wheel.
     source = tmp_path / "source"

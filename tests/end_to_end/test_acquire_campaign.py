@@ -45,6 +45,7 @@ NAMES = [
 ]
 
 
+@pytest.mark.long
 def test_campaign_takes_everything_once(acquire, small_rig, campaign, tmp_path):
     arguments = ("--campaign", campaign(), "--rig", small_rig(), "--out", tmp_path)
     code, out, err = acquire(*arguments)
@@ -70,6 +71,7 @@ def test_campaign_takes_everything_once(acquire, small_rig, campaign, tmp_path):
     assert {path.name: path.stat().st_mtime_ns for path in folder.glob("*.h5")} == before
 
 
+@pytest.mark.long
 def test_stopped_campaign_goes_on_with_the_state_it_stopped_at(acquire, small_rig, campaign, tmp_path, monkeypatch):
     from acquisition.screen.progress import ConsoleProgress
     from acquisition.stop_request import StopRequest
@@ -179,6 +181,7 @@ def test_another_campaign_in_the_same_folder_is_refused(acquire, small_rig, camp
     assert "campaign.omega_deg" in err
 
 
+@pytest.mark.long
 def test_exposure_is_found_for_each_geometry(acquire, small_rig, campaign, tmp_path):
     file = campaign(exposure_s="{kind: auto}", plans="{drr: drr.yaml}", omega_deg="[40, 80]")
     code, _, err = acquire("--campaign", file, "--rig", small_rig(), "--out", tmp_path)

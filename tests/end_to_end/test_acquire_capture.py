@@ -67,6 +67,7 @@ def test_the_capture_says_what_it_is(acquire, small_rig, tmp_path):
         assert np.all(np.diff(capture.column("host_time_s")) > 0)
 
 
+@pytest.mark.long
 def test_same_plan_and_seed_give_the_same_bytes(acquire, small_rig, tmp_path):
     plan = tmp_path / "plan.yaml"
     plan.write_text("kind: plan\ndarks: 2\nstates: {kind: rotating_retarders, states: 20, step_deg: 18}\n")
@@ -127,6 +128,7 @@ def test_exposure_is_recorded_as_the_camera_reads_it_back(acquire, small_rig, tm
         np.testing.assert_allclose(capture.column("exposure_s"), np.tile([25e-6, 2540e-6], 3), rtol=1e-9)
 
 
+@pytest.mark.long
 def test_bracketed_capture_sees_dark_and_bright_pixels(acquire, small_rig, tmp_path):
     """Eight times the exposure saturates the bright pixels; the reduction takes those from the short one.
 

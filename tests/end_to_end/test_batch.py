@@ -146,6 +146,7 @@ def test_an_empty_folder_is_told(process, tmp_path):
     assert (code, err) == (2, [f"error: {tmp_path} holds no captures. Give files, or the folder that they are in."])
 
 
+@pytest.mark.long
 def test_a_missing_picture_is_drawn_again(lab, process):
     process("reduce", lab)
     before = (lab / "one_2.mueller.png").read_bytes()

@@ -34,6 +34,7 @@ def scaled(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return truth * (np.sum(image * truth) / np.sum(truth**2))
 
 
+@pytest.mark.long
 def test_mueller_image_and_xi0_agree_with_the_scene(acquire, small_rig, configs: Path, tmp_path: Path) -> None:
     code, out, err = acquire("--omega", 35, "--rig", small_rig(), "--out", tmp_path)
     assert code == 0, err
@@ -60,6 +61,7 @@ def test_mueller_image_and_xi0_agree_with_the_scene(acquire, small_rig, configs:
             assert np.mean((low <= truth.xi0[good]) & (truth.xi0[good] <= high)) == pytest.approx(level, abs=room), name
 
 
+@pytest.mark.long
 def test_xi0_from_a_stokes_capture_agrees_with_the_scene(acquire, small_rig, configs: Path, tmp_path: Path) -> None:
     code, out, err = acquire(
         "--mode", "stokes", "--omega", 35, "--rig", small_rig(rows=256, columns=320), "--out", tmp_path
@@ -92,6 +94,7 @@ def test_stokes_capture_without_arm_angle(configs: Path, synthetic_capture, tmp_
         xi0_of_stokes(tmp_path / "s.h5", geometry, material, tmp_path / "x.h5", step=Step("xi0", {}), overwrite=False)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("sample", "omega", "expected"),
     [("air", 180, np.eye(4)), ("mirror", 10, np.diag([1.0, 1.0, -1.0, -1.0]))],

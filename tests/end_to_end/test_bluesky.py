@@ -121,6 +121,7 @@ def test_what_the_rig_forbids_fails_the_plan(bench, engine):
         run(scan([], bench.axes["arm"], 0, 720, 2))
 
 
+@pytest.mark.long
 def test_a_capture_of_40_states_is_paused_and_resumed(bench, engine, tmp_path):
     run, documents = engine
     device = bench.capture(PLAN, tmp_path / "captures")
@@ -232,6 +233,7 @@ def _omegas(documents):
             yield round(event["arm"], 2), capture.header.omega_deg, told
 
 
+@pytest.mark.long
 def test_a_scan_of_omega_takes_each_capture_where_the_arm_stands(bench, engine, tmp_path):
     run, documents = engine
     device = bench.capture(SHORT, tmp_path / "captures")

@@ -102,6 +102,7 @@ def of_film(folder):
     return {row["quantity"]: float(row["value"]) for row in rows if row["sample"] == "film"}
 
 
+@pytest.mark.long
 def test_without_a_geometry_every_capture_has_its_means(folder, configs, process, tmp_path):
     code, out, err = process("campaign", folder, "--out", tmp_path / "out")
     assert code == 0, err
@@ -167,6 +168,7 @@ def small(folder, configs, name, omega, states=40, true=None, scene="white_diffu
     return path
 
 
+@pytest.mark.long
 def test_the_campaigns_own_air_corrects_its_instrument(configs, process, tmp_path):
     instrument = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     azimuth = instrument.value_of("psg_retarder.azimuth_deg")
@@ -206,6 +208,7 @@ def test_tables_compared_by_hand_give_the_campaigns_number(here, configs, proces
     assert (code, "give numbers in degrees" in err) == (2, True)
 
 
+@pytest.mark.long
 def test_report_of_a_campaign_shows_its_tables_and_eigenvalues(folder, here, process, tmp_path):
     results = here.tables["mueller", 662.0].parent
     code, _, err = process("report", results, "--out", tmp_path / "r.html")
@@ -279,6 +282,7 @@ def test_no_scheduler_is_a_message(folder, configs, process, monkeypatch):
     assert "scheduler" in err
 
 
+@pytest.mark.long
 def test_registering_finds_a_sphere_that_the_geometry_file_misses(folder, configs, process, tmp_path):
     wrong = tmp_path / "wrong.yaml"
     text = (configs / "geometries/one_inch_sphere.yaml").read_text()
@@ -297,6 +301,7 @@ def test_registering_finds_a_sphere_that_the_geometry_file_misses(folder, config
     assert ViewingGeometry.load(tmp_path / "right.yaml").camera.focal_length_mm == pytest.approx(60, abs=0.8)
 
 
+@pytest.mark.long
 def test_tables_and_material_and_extrapolation(folder, configs, process, tmp_path):
     geometry = configs / "geometries/one_inch_sphere.yaml"
     products = []

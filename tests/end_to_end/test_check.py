@@ -34,6 +34,7 @@ def air(tmp_path, configs):
     return take
 
 
+@pytest.mark.long
 def test_what_changed_since_is_named_and_kept(air, process):
     reference = air("reference", 1.0, 1)
     for number, turned in enumerate((1.0, 1.5), 2):

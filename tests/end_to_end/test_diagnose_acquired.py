@@ -30,6 +30,7 @@ def diagnosed(acquire, small_rig, configs, tmp_path):
     return run
 
 
+@pytest.mark.long
 def test_a_rig_as_described_is_consistent(diagnosed, configs, tmp_path, capfd):
     said = diagnosed([])
     assert said["verdict"] == "consistent"
@@ -48,6 +49,7 @@ def test_a_rig_as_described_is_consistent(diagnosed, configs, tmp_path, capfd):
     assert "nothing is corrected" in (tmp_path / "new.yaml").read_text().splitlines()[0]
 
 
+@pytest.mark.long
 def test_an_undeclared_fault_is_found(diagnosed):
     said = diagnosed([{"kind": "angle_offset", "axis": "psg", "offset_deg": 0.5}])
     assert said["verdict"] == "explained"
@@ -57,6 +59,7 @@ def test_an_undeclared_fault_is_found(diagnosed):
     assert found["value"] == pytest.approx(0.5, abs=3 * found["stderr"])
 
 
+@pytest.mark.long
 def test_a_residual_below_the_noise_says_what_is_explained(diagnosed, capfd):
     """A slip that is seen beyond doubt leaves the rms of single pixels under its bound, before and after."""
     (effect,) = diagnosed([{"kind": "angle_slip", "axis": "psa", "at_index": 13, "slip_deg": 0.8}])["effects"]

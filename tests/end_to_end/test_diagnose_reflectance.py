@@ -58,6 +58,7 @@ def error_of_xi0(scene: Scene, product: Path) -> float:
     return rmsd((xi0 - scene.truth(OMEGA_DEG, NM, *xi0.shape).xi0)[valid])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["rgb950", "linear_stokes"])
 def test_first_surface_lacks_polarized_diffuse(name, configs, scene, tmp_path, capsys):
     path = capture(tmp_path, configs, scene, name)
@@ -96,6 +97,7 @@ def test_first_surface_lacks_polarized_diffuse(name, configs, scene, tmp_path, c
     assert "exists and is not replaced" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_what_acquire_writes_in_stokes_mode_is_enough(acquire, small_rig, configs, tmp_path, capfd):
     rig = small_rig(rows=240, columns=240)
     assert acquire("--omega", 35, "--mode", "stokes", "--rig", rig, "--out", tmp_path)[0] == 0
@@ -115,6 +117,7 @@ def test_what_acquire_writes_in_stokes_mode_is_enough(acquire, small_rig, config
     assert "Use the instrument file that belongs to the capture" in capfd.readouterr().err
 
 
+@pytest.mark.long
 def test_geometry_and_instrument_that_were_found_end_the_error(configs, scene, tmp_path, capsys):
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     moved = scene_faults.ArmZeroFault(scene_faults.moved_sphere(scene, 0.5, -0.3, 0.02), 2.0)

@@ -68,8 +68,11 @@ SMALLER = {
     "configs/campaigns/red_sphere.yaml": {"stop: 90": "stop: 20", "[451, 662]": "[662]"},
 }
 UNTIL_CTRL_C = "until Ctrl-C"
-#: The page with a campaign, its products and a report.
-LONGEST = "processing"
+#: Pages whose commands take more than about three seconds of a processor; the README's run always.
+LONG = {
+    *("acquisition", "calibration", "closing-the-loop", "other-tools", "processing", "quantities", "view"),
+    *("tutorial-close-the-loop", "tutorial-your-own-polarimeter"),
+}
 SLOW = "UMOV_SLOW"
 
 
@@ -183,7 +186,7 @@ def run(words: list[str]) -> None:
 
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(p, id=p.stem, marks=[pytest.mark.long] if p.stem == LONGEST else []) for p in WITH_CODE],
+    [pytest.param(p, id=p.stem, marks=[pytest.mark.long] if p.stem in LONG else []) for p in WITH_CODE],
 )
 def test_commands_and_python_run_as_they_stand(
     page: Path, desk: Path, own_files: dict[str, Callable[[], object]], request: pytest.FixtureRequest

@@ -25,9 +25,12 @@ SAID = {
     "design_states": "free angles:     71.4",
     "algebra": "and its process is the retarder: True",
 }
+LONG = {"close_the_loop", "design_states"}
 
 
-@pytest.mark.parametrize("name", SAID)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] if name in LONG else []) for name in SAID]
+)
 def test_script(name, tmp_path, monkeypatch, capsys, small_rig, default_rig):
     monkeypatch.setattr("sys.argv", [name, str(tmp_path)])
     monkeypatch.chdir(tmp_path)
@@ -41,7 +44,7 @@ def test_script(name, tmp_path, monkeypatch, capsys, small_rig, default_rig):
         assert after < 0.7 * before
 
 
-@pytest.mark.parametrize("name", ["capture_to_xi0", "close_the_loop"])
+@pytest.mark.parametrize("name", ["capture_to_xi0", pytest.param("close_the_loop", marks=pytest.mark.long)])
 def test_notebook(name, capsys, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "agg")
     cells = json.loads((EXAMPLES / f"{name}.ipynb").read_text())["cells"]

@@ -288,6 +288,7 @@ def mueller_of(process, capture):
     return m / m[0, 0]
 
 
+@pytest.mark.long
 def test_the_tutorial_of_an_own_polarimeter_corrects_its_matrix(tmp_path, process, monkeypatch):
     scope = runpy.run_path(str(ROOT / "examples/other_lab.py"))
     scope["write_folders"](tmp_path / "other_lab")

@@ -21,6 +21,7 @@ def test_the_next_sample_is_measured_better_or_as_before(name, tmp_path):
     assert row.written < 3 * row.stated
 
 
+@pytest.mark.long
 @pytest.mark.measured
 def test_a_measured_mirror_is_one(tmp_path):
     row = chain.mirror_frames(tmp_path)
@@ -28,6 +29,7 @@ def test_a_measured_mirror_is_one(tmp_path):
     assert row.written < 3 * row.stated
 
 
+@pytest.mark.long
 @pytest.mark.measured
 @pytest.mark.parametrize("nm", chain.MEASURED_NM)
 def test_a_measured_plate_is_nearer_to_the_ratio_of_its_channels(nm, public_files, tmp_path):
@@ -37,6 +39,7 @@ def test_a_measured_plate_is_nearer_to_the_ratio_of_its_channels(nm, public_file
     assert row.written < (0.005 if nm < 1900 else 0.02)
 
 
+@pytest.mark.long
 @pytest.mark.measured
 def test_a_plate_of_fewer_states_of_air_is_nearer_too(public_files, tmp_path):
     """At 1300 nm no cause is left: the gain of the right beam is a value of the train, as no two beams are alike."""

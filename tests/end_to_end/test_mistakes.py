@@ -125,6 +125,7 @@ def test_a_table_of_the_user_is_not_replaced_by_a_design(run, configs, tmp_path)
     assert table.read_text() == "psg,psa\n0,0\n"
 
 
+@pytest.mark.long
 def test_a_file_that_is_not_meant_is_called_what_it_is(run, acquire, capture, configs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text, folder, product = tmp_path / "notes.txt", tmp_path / "empty", tmp_path / "näme with blanks.h5"

@@ -331,6 +331,7 @@ def test_a_mueller_image_alone_is_exported_as_its_own_figure(exported, tmp_path)
     assert alone.read_bytes() == whole.read_bytes()
 
 
+@pytest.mark.long
 def test_figures_are_written_and_nothing_is_replaced(exported, product, tmp_path, capsys):
     path = exported("product", "--to", "pdf", "--plane", "mueller_errors")[0]
     assert path.read_bytes().startswith(b"%PDF")

@@ -54,6 +54,7 @@ def test_it_passes_the_conformance_kit(run):
     assert int(done.stdout.rpartition(" passed")[0].split()[-1]) > 60
 
 
+@pytest.mark.long
 def test_a_rig_file_and_an_instrument_file_use_it(run, small_rig, configs, tmp_path):
     yaml = YAML()
     path = small_rig()

@@ -47,6 +47,7 @@ def measured(tmp_path: Path, instrument: Path) -> Measured:
     return Measured(tmp_path, instrument, np.diag([1.0, 1.0, -1.0, -1.0]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 def test_import_reduce_figure(suffix: str, tmp_path: Path, instrument: Path, process: Run) -> None:
     data = Measured(tmp_path, instrument, np.diag([1.0, 1.0, -1.0, -1.0]), suffix)

@@ -73,6 +73,7 @@ def test_report_is_self_contained(campaign: Path, capsys: pytest.CaptureFixture[
     assert run(capsys, "report", campaign / "rmsd.csv", "--out", out, "--overwrite")[0] == 0
 
 
+@pytest.mark.long
 def test_a_report_on_paper_is_whole_and_has_nothing_to_press(campaign: Path, browser: Browser) -> None:
     out = campaign / "report.html"
     with pytest.raises(SystemExit):

@@ -45,6 +45,7 @@ def capture(synthetic_capture, configs: Path) -> Path:
     )
 
 
+@pytest.mark.long
 def test_all_maps_with_errors(process: Run, capture: Path, tmp_path: Path) -> None:
     out, figure = tmp_path / "q.h5", tmp_path / "q.png"
     options = ("--also", "symmetric", "--also", "differential", "--out", out, "--figure", figure)
@@ -88,6 +89,7 @@ def test_all_maps_with_errors(process: Run, capture: Path, tmp_path: Path) -> No
         assert product.facts["median_xi0"] == pytest.approx(median, abs=1e-6)
 
 
+@pytest.mark.long
 def test_pairs_and_refusals(process: Run, capture: Path, tmp_path: Path) -> None:
     out = tmp_path / "q.h5"
     code, _, err = process("quantities", capture, "--pair", "45,right", "--out", out)
@@ -107,6 +109,7 @@ def test_pairs_and_refusals(process: Run, capture: Path, tmp_path: Path) -> None
     assert "holds a quantities image; this needs: mueller" in err
 
 
+@pytest.mark.long
 def test_axostep_mueller_files(process: Run, capture: Path, tmp_path: Path) -> None:
     assert process("reduce", capture)[0] == 0
     product = capture.with_suffix(".mueller.h5")

@@ -152,6 +152,7 @@ def test_fit_of_the_truth_is_far_better_than_the_declared_instrument(bench, conf
     assert known_oracle(folder, truth, configs, "joint") < Reduced.of(away / "validation.h5", declared).error(exact) / 3
 
 
+@pytest.mark.long
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("group", "seed", "given"), [("none", 1, "joint"), ("real", 5, "sphere"), ("real", 7, "air")])
 def test_answer_to_a_small_bench_harms_nothing(group, seed, given, configs, tmp_path):

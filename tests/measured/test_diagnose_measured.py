@@ -81,6 +81,7 @@ def telescope(public_files, folder: Path, instrument: Path) -> dict[int, Path]:
     return {int(table.wavelength_nm): imported(folder, table, instrument) for table in tables}
 
 
+@pytest.mark.long
 def test_the_telescope_at_one_wavelength(public_files, configs, tmp_path):
     """By itself it does not tell what is depolarized: with that open nothing of M would be certain enough."""
     instrument = configs / "instruments/dual_beam_charis.yaml"
@@ -106,6 +107,7 @@ def held_out_of_each(public_files, configs: Path, tmp_path: Path, wavelengths: t
     return [c for c in d.correction.checks if c.name.startswith("rms on held-out data of")]
 
 
+@pytest.mark.long
 def test_four_wavelengths_of_the_telescope_share_the_angles_of_their_states(public_files, configs, tmp_path):
     told = held_out_of_each(public_files, configs, tmp_path, (1575, 1744, 1932, 2139))
     assert len(told) == 4
@@ -164,6 +166,7 @@ def test_wollaston_the_source_is_the_cause(public_files, configs, tmp_path):
     assert np.sqrt(whole.square.sum() / whole.count.sum()) < 0.003
 
 
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_mirror_frames_down_to_a_quarter_percent(configs, tmp_path):
     instrument = configs / "instruments/drr_imaging_630nm.yaml"
@@ -175,6 +178,7 @@ def test_mirror_frames_down_to_a_quarter_percent(configs, tmp_path):
     assert {"path_retardance", "retarder_transmission", "analyzer_transmission", "rotation_eccentricity"} <= kinds
 
 
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_the_gain_learnt_on_one_picture_mends_another(public_files, configs, tmp_path):
     instrument = configs / "instruments/linear_stokes.yaml"

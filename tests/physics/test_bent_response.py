@@ -16,6 +16,7 @@ STATES, PIXELS, NM = 40, 64, 662.0
 BEND = 0.03
 
 
+@pytest.mark.long
 def test_a_bend_beside_other_faults_is_not_taken_for_several(configs: Path, tmp_path: Path) -> None:
     """A variance of the counts that is 2 % off, of 100 000 values, is more than most causes explain."""
     file = configs / "instruments/rgb950.yaml"

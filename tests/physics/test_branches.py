@@ -9,6 +9,7 @@ from benchmarks import instrument_chain as chain
 OTHER_SIGN = np.diag([1.0, 1.0, 1.0, -1.0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("instrument", "by_deg"), list(zip(chain.TWO_PLATES, (100, 80, 40, 260, 130), strict=True)))
 def test_the_start_decides_nothing(instrument, by_deg, tmp_path):
     found = chain.two_starts(instrument, tmp_path, by_deg=by_deg)
@@ -20,6 +21,7 @@ def test_the_start_decides_nothing(instrument, by_deg, tmp_path):
     assert "The instrument file decides" in found.branch
 
 
+@pytest.mark.long
 def test_a_file_that_is_wrong_for_every_plate_decides_for_the_other_sign(tmp_path):
     found = chain.two_starts("rgb950", tmp_path, chain.PLATES)
     first, second = (m.reshape(4, 4) for m in found.mueller)

@@ -67,6 +67,7 @@ def repeated():
     return [(fit_curves(parts, FREE, 3), fit_trains(parts, FREE)) for parts in every]
 
 
+@pytest.mark.long
 def test_curves_have_smaller_errors_than_values_at_each_wavelength(repeated):
     truth = np.array([true_values(nm) for nm in ELECTRONS])
     smooth = np.array([[c.values for c in curves.calibrations] for curves, _ in repeated]) - truth

@@ -131,6 +131,7 @@ def test_command_writes_a_plan_that_acquire_takes(configs, tmp_path):
     assert "the instrument turns" in str(wrong.exception)
 
 
+@pytest.mark.long
 def test_the_labs_own_table_is_told_beside_the_best_for_its_plates(configs):
     options = ["design", str(configs / "instruments/rgb950.yaml"), "--wavelength", "662", "--optimize", "angles"]
     done = CliRunner().invoke(app, options)

@@ -47,6 +47,7 @@ def test_jones_bench_and_mueller_model_are_the_same_instrument(configs):
     assert a == pytest.approx(model.analyzer_states(angles)[:, 0], abs=1e-12)
 
 
+@pytest.mark.long
 def test_a_retardance_error_is_invisible_with_an_unknown_sample_and_plain_with_air(configs, tmp_path):
     """docs/conventions.md, "What an unknown sample hides"."""
     wrong = np.deg2rad(127.12 + 1.0)
@@ -65,6 +66,7 @@ def test_a_retardance_error_is_invisible_with_an_unknown_sample_and_plain_with_a
     assert found.stderr < 0.05
 
 
+@pytest.mark.long
 def test_azimuths_of_analyzer_and_its_retarder_are_named_together(configs, tmp_path):
     """With an unknown sample the two cannot be told apart, and air is what separates them."""
     d = diagnosed(capture(tmp_path, configs, TrueBench(oa=np.deg2rad(13.41 + 0.4)), air=False), configs)
@@ -74,6 +76,7 @@ def test_azimuths_of_analyzer_and_its_retarder_are_named_together(configs, tmp_p
     assert "air" in d.recommendation
 
 
+@pytest.mark.long
 def test_a_state_that_is_cut_off_at_zero_is_left_out(configs, tmp_path):
     """A black level that is too low for an offset; behind crossed polarizers nothing else is left."""
     bench = TrueBench(rows=40, columns=40)
@@ -93,6 +96,7 @@ def test_a_state_that_is_cut_off_at_zero_is_left_out(configs, tmp_path):
     assert slip.parameters["slip"].value == pytest.approx(0.4, abs=3.5 * slip.parameters["slip"].stderr)
 
 
+@pytest.mark.long
 def test_nothing_wrong_is_consistent(configs, tmp_path):
     """What a pixel's residual shares with its own fit, through noise that differs from state to state, adds up."""
     found = diagnosed(capture(tmp_path, configs, TrueBench(rows=400, columns=400), air=False, seed=4), configs)
@@ -100,6 +104,7 @@ def test_nothing_wrong_is_consistent(configs, tmp_path):
     assert max(found.captures[0].tests_before.values()) < 4
 
 
+@pytest.mark.long
 def test_random_gains_in_air_are_not_given_a_name(configs, tmp_path):
     """One known sample and one channel: a gain for each state explains anything, so it explains nothing."""
     bench = TrueBench()
@@ -114,6 +119,7 @@ def test_random_gains_in_air_are_not_given_a_name(configs, tmp_path):
     assert "empirical" in empirical.note
 
 
+@pytest.mark.long
 def test_a_small_effect_beside_an_image_that_wanders_by_a_pixel(configs, tmp_path):
     """Second derivatives of the image leave more of such a shift than the other effect explains."""
     bench = TrueBench(rows=32, columns=32, og=np.deg2rad(0.5))
@@ -133,6 +139,7 @@ def test_a_small_effect_beside_an_image_that_wanders_by_a_pixel(configs, tmp_pat
     assert again.verdict == "consistent"
 
 
+@pytest.mark.long
 def test_a_shift_of_an_even_image_cannot_be_seen(configs, tmp_path):
     def unobservable(waves: float) -> set[str]:
         random, bench = np.random.default_rng(7), TrueBench(rows=64, columns=64)
@@ -149,6 +156,7 @@ def test_a_shift_of_an_even_image_cannot_be_seen(configs, tmp_path):
     assert not shifts & unobservable(1.0)
 
 
+@pytest.mark.long
 def test_a_second_effect_beside_a_retardance_that_varies_over_the_image(configs, tmp_path):
     """Every tile has a matrix of its own then, and the counts are corrected all the same."""
     bench = TrueBench(rows=40, columns=40)
@@ -183,6 +191,7 @@ def test_shifts_on_a_mosaic_are_told_in_pixels_of_the_sensor(configs, tmp_path):
         assert value.stderr < 0.2
 
 
+@pytest.mark.long
 def test_what_changes_in_a_part_of_the_image_is_no_source(configs, tmp_path):
     bench = TrueBench(rows=40, columns=40)
     bench.material_level.append((0, lambda k: 1 + 0.15 * (1 - np.exp(-3 * k / STATES))))
@@ -191,6 +200,7 @@ def test_what_changes_in_a_part_of_the_image_is_no_source(configs, tmp_path):
     assert found.verdict == "unexplained"
 
 
+@pytest.mark.long
 def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, capsys):
     path = capture(tmp_path, configs, TrueBench(dg=np.deg2rad(129.0)), air=True)
     instrument, new = configs / "instruments/rgb950.yaml", tmp_path / "new.yaml"
@@ -232,6 +242,7 @@ def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, c
         assert target.read_bytes() == kept
 
 
+@pytest.mark.long
 def test_an_instrument_file_that_is_larger_than_what_is_read_is_not_written(configs, tmp_path, monkeypatch):
     path = capture(tmp_path, configs, TrueBench(rows=8, columns=8, dg=np.deg2rad(129.0)), air=True)
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml")

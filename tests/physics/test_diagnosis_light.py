@@ -106,6 +106,7 @@ def test_pixels_at_an_edge_are_left_out_and_those_of_a_slope_are_not(configs, tm
     assert left(stripes).usable.mean() == pytest.approx(0.25, abs=0.05)
 
 
+@pytest.mark.long
 def test_a_mean_that_only_its_linearization_explains_is_not_taken(configs, tmp_path, monkeypatch):
     """The search with the noise of the light ends far off in a capture of air: what was found before it stays."""
     bench = TrueBench(rows=SIDE, columns=SIDE, electrons=6000.0)

@@ -56,6 +56,7 @@ def sentences(found: Diagnosis) -> list[str]:
     return [name.partition("[")[2].rstrip("]") for name in every if name.startswith("unlisted")]
 
 
+@pytest.mark.long
 def test_an_image_that_moves_is_told_from_a_ghost_that_goes_round(configs, tmp_path, bench):
     """To first order both move what is smooth; at the rim of the disc only one does."""
     turn = 2 * np.pi / STATES
@@ -68,6 +69,7 @@ def test_an_image_that_moves_is_told_from_a_ghost_that_goes_round(configs, tmp_p
     assert not sure(found)
 
 
+@pytest.mark.long
 def test_an_image_that_moves_twice_a_turn_is_corrected_without_a_name(configs, tmp_path, bench):
     turn = 4 * np.pi / STATES
     bench.shift.append(lambda k, a: (0.15 * np.cos(turn * k), 0.15 * np.sin(turn * k)))
@@ -99,6 +101,7 @@ def test_light_that_moves_over_a_disc_is_no_image_that_moves(configs, tmp_path, 
     assert [e.element for e in found.applied()] == ["brightness right and brightness down of image over time"]
 
 
+@pytest.mark.long
 def test_a_black_level_that_drifts_is_no_bent_response(configs, tmp_path, bench):
     found = diagnosed(tmp_path, configs, bench, drift_counts=200)
     assert not sure(found)
@@ -132,6 +135,7 @@ def test_light_that_is_reflected_inside_a_plate_passes_it_three_times(configs):
     )
 
 
+@pytest.mark.long
 def test_a_plate_whose_retardance_changes_twice_a_turn_is_not_called_a_transmission(configs, tmp_path, bench):
     turn = 4.91 * 2 * np.pi / STATES
     bench.retardance.append(lambda k, a: (0.0, np.deg2rad(1.5) * np.cos(2 * turn * k - 0.4)))
@@ -144,6 +148,7 @@ def test_a_plate_whose_retardance_changes_twice_a_turn_is_not_called_a_transmiss
     assert sure(found) == ["retarder_transmission"]
 
 
+@pytest.mark.long
 def test_optics_that_differ_from_part_to_part_are_not_called_by_their_name(configs, tmp_path, bench):
     """A magnification that follows the plate moves the rim alone; nothing of a train does."""
     y, x = np.mgrid[:PIXELS, :PIXELS] - (PIXELS - 1) / 2
@@ -151,6 +156,7 @@ def test_optics_that_differ_from_part_to_part_are_not_called_by_their_name(confi
     assert not sure(diagnosed(tmp_path, configs, bench))
 
 
+@pytest.mark.long
 def test_a_sample_that_turns_is_not_angles_of_an_axis(configs, tmp_path, bench):
     """Its azimuth drifts with all plates and polarizers; single angles of the analyzer can stand for that."""
     bench.turned.append(lambda k: np.deg2rad(-0.8) * (k / (STATES - 1) - 0.5))
@@ -159,6 +165,7 @@ def test_a_sample_that_turns_is_not_angles_of_an_axis(configs, tmp_path, bench):
     assert "azimuth of sample over time" in sentences(found)
 
 
+@pytest.mark.long
 def test_frames_that_are_read_with_the_next_ones_are_not_angles_of_an_axis(configs, tmp_path, bench):
     image_lag(bench, np.random.default_rng(5), STATES)
     found = diagnosed(tmp_path, configs, bench)
@@ -166,6 +173,7 @@ def test_frames_that_are_read_with_the_next_ones_are_not_angles_of_an_axis(confi
     assert "lag of detector" in sentences(found)
 
 
+@pytest.mark.long
 def test_a_lamp_that_drifts_while_the_machine_is_busy(configs, tmp_path):
     """The states come unevenly, and the host stamps them late: the camera's clock shows by how much."""
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
@@ -177,6 +185,7 @@ def test_a_lamp_that_drifts_while_the_machine_is_busy(configs, tmp_path):
     assert [e.kind for e in found.effects] == [e.kind for e in found.applied()] == ["source_drift"]
 
 
+@pytest.mark.long
 def test_a_lamp_that_jumps_is_no_source_that_drifts(configs, tmp_path, bench):
     lamp_jump(bench, np.random.default_rng(3), STATES)
     found = diagnosed(tmp_path, configs, bench)
@@ -187,6 +196,7 @@ def test_a_lamp_that_jumps_is_no_source_that_drifts(configs, tmp_path, bench):
     assert sure(diagnosed(tmp_path, configs, bench)) == ["source_drift"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("fault", "seed"), [(etalon, 9002), (lamp_beat, 9003)])
 def test_a_wave_of_any_frequency_is_no_fault_of_the_plate(fault, seed, configs, tmp_path, bench):
     """Two waves of the grid, or the plate's own, explain a part of a wave between them."""

@@ -72,6 +72,7 @@ def test_what_is_wrong_gets_its_name(scene, declared, tmp_path, kind):
     assert effect.evidence > 50
 
 
+@pytest.mark.long
 def test_arm_zero_and_registration_cannot_be_told_apart_by_linear_stokes(scene, configs, tmp_path):
     declared = InstrumentModel.load(configs / "instruments/linear_stokes.yaml")
     fault = SphereFault("arm_zero", scene_faults.ArmZeroFault(scene, 2.0), declared, scene.material)
@@ -88,6 +89,7 @@ def test_arm_zero_and_registration_cannot_be_told_apart_by_linear_stokes(scene, 
     assert (effect.kind, effect.indistinguishable_from) == ("arm_zero", ())
 
 
+@pytest.mark.long
 def test_light_from_the_support_is_interreflection(scene, configs, tmp_path):
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     fault = SphereFault("interreflection", scene_faults.LitSupport(scene, 0.3), declared, scene.material)
@@ -108,6 +110,7 @@ def test_what_is_not_in_the_list_gets_no_name(scene, configs, tmp_path, kind):
     assert d.unexplained.description
 
 
+@pytest.mark.long
 def test_two_effects_at_once(scene, configs, tmp_path):
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     both = scene_faults.ArmZeroFault(scene, 2.0)

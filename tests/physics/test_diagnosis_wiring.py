@@ -70,6 +70,7 @@ def test_the_filter_of_another_wavelength_is_told(configs, tmp_path, air):
     assert "wavelength_nm: 451" in found.told
 
 
+@pytest.mark.long
 def test_a_mistake_is_told_where_the_train_has_nominal_values(configs, tmp_path):
     """Azimuths and retardances that `calibrate` leaves open do not mend an axis that turns the other way."""
     bench = TrueBench(rows=9, columns=9, og=np.deg2rad(-3.0), dg=np.deg2rad(120.0), oa=np.deg2rad(30.0))

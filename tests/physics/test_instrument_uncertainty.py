@@ -112,6 +112,7 @@ def test_correlated_values_move_together(stated):
     assert off.T @ off == pytest.approx(0.01 * np.array([[1, 0.96], [0.96, 1]]), abs=1e-9)
 
 
+@pytest.mark.long
 def test_total_intervals_cover_drawn_instruments(stated, synthetic_capture, tmp_path):
     """30 instruments drawn from the stated uncertainty; noise alone would cover few of them."""
     random = np.random.default_rng(5)
@@ -174,6 +175,7 @@ def test_a_table_holds_what_each_direction_does_to_its_means(stated, synthetic_c
         tabulate([plain[2]], geometry, "degree", table)
 
 
+@pytest.mark.long
 def test_a_mueller_table_covers_an_instrument_that_is_off_and_its_noise(stated, synthetic_capture, tmp_path, configs):
     """One uncertain value off by u moves every element of every bin by its direction; the noise is that of repeats."""
     model = InstrumentModel.load(stated).at(662)

@@ -39,6 +39,7 @@ def plain(configs):
     return InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
 
 
+@pytest.mark.long
 def test_means_of_1024_pixels_hold_their_errors(plain, synthetic_capture, tmp_path):
     """Every number of 20 means: all within a few of their errors, 95 % inside their intervals."""
     random = np.random.default_rng(11)
@@ -62,6 +63,7 @@ def test_means_of_1024_pixels_hold_their_errors(plain, synthetic_capture, tmp_pa
         assert np.mean(inside[name]) > 0.8, name
 
 
+@pytest.mark.long
 def test_a_mosaic_mean_knows_what_neighbours_share(configs, synthetic_capture, tmp_path):
     """Errors of pixels over sqrt(n) are 1.7 to 2.7 too small."""
     random = np.random.default_rng(3)

@@ -28,6 +28,7 @@ def said(model, *captures):
     return found, {e.kind: e.answer for e in found.effects if e.confident}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("times", [0.965, 1.04])
 def test_a_gain_that_is_stated_some_percent_wrong_hides_no_cause(configs, tmp_path, times):
     """Four percent of the variance of 160 000 intensities is eleven standard deviations of their sum of squares."""
@@ -42,6 +43,7 @@ def test_a_gain_that_is_stated_some_percent_wrong_hides_no_cause(configs, tmp_pa
     assert found.error_after.chi2_reduced == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.long
 def test_an_offset_is_no_other_read_noise(configs, tmp_path):
     """A ball before a dark wall: what is added to all counts takes photon noise along in what is expected of them."""
     bench = TrueBench(rows=SIDE, columns=SIDE, read_noise=3.0)

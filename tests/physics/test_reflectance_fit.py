@@ -215,6 +215,7 @@ def apart(m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return m + m[:, :1, :1] * np.einsum("k,nkij->nij", [0.025, 0.0, -0.025], processes)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("electrons", [200, 20_000])
 def test_small_eigenvalues_that_differ_do_not_move_the_constants(sphere, electrons):
     """Linear correlation is off by tens of its errors of noise there; its interval knows, and its chi-square."""

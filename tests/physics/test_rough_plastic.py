@@ -128,6 +128,7 @@ def rotation(angle: float) -> np.ndarray:
     return np.array([[1, 0, 0, 0], [0, c, s, 0], [0, -s, c, 0], [0, 0, 0, 1]])
 
 
+@pytest.mark.long
 def test_a_material_file_is_rendered_back(tmp_path, configs):
     path = tmp_path / "m.yaml"
     path.write_text("kind: rough_plastic\nname: tile\nconstants: {662: {n: 1.5, alpha: 0.3, albedo: 0.25}}\n")

@@ -97,6 +97,7 @@ def fits(page: Page) -> bool:
     return bool(page.evaluate("document.documentElement.scrollWidth <= innerWidth"))
 
 
+@pytest.mark.long
 def test_a_button_waits_for_its_script(address, window):
     page = window()
     held: list[Route] = []
@@ -115,6 +116,7 @@ def own_alarms(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
 
+@pytest.mark.long
 def test_an_alarm_that_comes_while_a_page_is_open_is_shown_and_acknowledged(own_alarms, address, window):
     page = window()
     page.goto(f"{address}/")
@@ -285,6 +287,7 @@ def _narrow_and_dark(page: Page, address: str, capture: str) -> None:
     assert page.evaluate("document.activeElement.className") == "skip"
 
 
+@pytest.mark.long
 def test_a_page_without_its_token_shows_nothing(address, window):
     page = window()
     answer = page.goto(address[: address.rindex("/")] + "/")

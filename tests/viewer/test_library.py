@@ -47,6 +47,7 @@ def test_pages_have_every_capture_once_and_a_search_stays(client, lab, drr_captu
     assert "q=copy" in re.search(r'href="([^"]*)" rel="prev"', text)[1]
 
 
+@pytest.mark.long
 def test_a_second_start_reads_no_file_again(lab, drr_capture, monkeypatch):
     copies(lab, drr_capture("one.h5"), MOST)
     before = [vars(e) for e in viewer.library.Library(lab).entries()]
@@ -88,6 +89,7 @@ def test_three_thousand_captures_have_their_first_page_in_a_second(lab, drr_capt
     assert min(times) < 1.0, times
 
 
+@pytest.mark.long
 def test_a_browser_sorts_turns_pages_and_shows_thumbnails(lab, drr_capture, address, chromium):
     playwright_api = pytest.importorskip("playwright.sync_api")
     copies(lab, drr_capture("one.h5", omega_deg=35.0), MOST)

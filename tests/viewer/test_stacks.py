@@ -79,6 +79,7 @@ def test_a_folder_without_products_says_how_to_make_them(client, drr_capture):
     assert "process reduce" in client.get("/stack").text
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("width", [1400, 380])
 def test_a_browser_follows_a_region(night, address, browser, width):
     page = browser.new_context(permissions=["clipboard-read", "clipboard-write"]).new_page()
