@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -67,9 +68,13 @@ class AxisConfig(BaseModel):
     identified_by : str
         Name of the entry that says which device this is; a kind without `serial_number` names another. The driver
         refuses a device that does not answer to it (WrongDevice).
+    unit : str
+        Of positions and targets: "deg", or "V" for a liquid crystal. Values and entries in degrees (`_deg`) are in
+        this unit.
     """
 
     identified_by: ClassVar[str] = "serial_number"
+    unit: ClassVar[Literal["deg", "V"]] = "deg"
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -103,3 +108,7 @@ class AxisConfig(BaseModel):
     def place(self) -> str:
         """What tells this axis from others on its line, in words; "" where a line has one axis only."""
         return ""
+
+    def named_states(self) -> Mapping[str, float]:
+        """Positions that the rig file gives a name, which a plan may use."""
+        return {}

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Any
+
 
 class DeviceError(Exception):
     """A device did not do what it was asked.
@@ -81,6 +84,8 @@ class MotionFailed(DeviceError):
         Time since the start of the motion and the time it was given.
     why : str
         What was seen: stalled, silent, fault flag, wrong end position.
+    unit : str
+        Of target and position; "V" for a liquid crystal.
     """
 
     def __init__(
@@ -93,9 +98,10 @@ class MotionFailed(DeviceError):
         allowed_s: float,
         why: str,
         what_to_do: str = "The axis was sent a stop. Look at the axis before you move it again",
+        unit: str = "deg",
     ) -> None:
-        asked = f"axis {axis}, " + ("home" if target_deg is None else f"move to {target_deg:.4f} deg")
-        last = "not known" if last_deg is None else f"{last_deg:.4f} deg"
+        asked = f"axis {axis}, " + ("home" if target_deg is None else f"move to {target_deg:.4f} {unit}")
+        last = "not known" if last_deg is None else f"{last_deg:.4f} {unit}"
         came_back = f"{why}; last position {last}, after {elapsed_s:.2f} s of {allowed_s:.2f} s allowed"
         super().__init__(asked, came_back, what_to_do)
         self.axis = axis
@@ -104,11 +110,12 @@ class MotionFailed(DeviceError):
         self.elapsed_s = elapsed_s
         self.allowed_s = allowed_s
         self.why = why
+        self.unit = unit
 
     def __reduce__(self) -> tuple[object, ...]:
         # Exception pickles by its args, which here are the three parts of the message.
-        rebuilt = (self.axis, self.target_deg, self.last_deg, self.elapsed_s, self.allowed_s)
-        return (type(self), (*rebuilt, self.why, self.what_to_do))
+        more: dict[str, Any] = {name: getattr(self, name) for name in ("allowed_s", "why", "what_to_do", "unit")}
+        return partial(type(self), self.axis, self.target_deg, self.last_deg, self.elapsed_s, **more), ()
 
 
 class MotionStopped(MotionFailed):

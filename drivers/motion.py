@@ -122,7 +122,7 @@ class Motion:
             short = None if axis.is_homed() else "the axis is idle but has no reference"
         else:
             off_deg = self._last.deg - self.target_deg
-            short = f"the axis came to rest off its target by {off_deg:+.4f} deg"
+            short = f"the axis came to rest off its target by {off_deg:+.4f} {axis.config.unit}"
             if abs(off_deg) <= axis.config.tolerance_deg:
                 short = None
         if short is None:
@@ -148,6 +148,7 @@ class Motion:
     def _failed(self, kind: type[MotionFailed], why: str, **more: str) -> MotionFailed:
         elapsed_s = self.axis.clock.now_s() - self._start_s
         last_deg = None if self._last is None else self._last.deg
+        more["unit"] = self.axis.config.unit
         return kind(self.axis.name, self.target_deg, last_deg, elapsed_s, allowed_s=self.allowed_s, why=why, **more)
 
     def _stop_and_describe(self, why: str) -> MotionFailed:
@@ -230,8 +231,8 @@ class MotionAxis(ABC):
             return
         ends = " to ".join("no limit" if end is None else f"{end:g}" for end in (limits.min_deg, limits.max_deg))
         raise LimitError(
-            f"axis {self.name}, move to {target_deg:g} deg",
-            f"the limits are {ends} deg",
+            f"axis {self.name}, move to {target_deg:g} {self.config.unit}",
+            f"the limits are {ends} {self.config.unit}",
             "Nothing was moved. Change the plan, or limits_deg in the rig file if they are wrong",
         )
 
@@ -292,10 +293,10 @@ class MotionAxis(ABC):
         """
         self.check(target_deg)
         with self._start_lock:
-            self._require_idle(f"move to {target_deg:g} deg")
+            self._require_idle(f"move to {target_deg:g} {self.config.unit}")
             if not self.is_homed():
                 raise NotHomedError(
-                    f"axis {self.name}, move to {target_deg:g} deg",
+                    f"axis {self.name}, move to {target_deg:g} {self.config.unit}",
                     "the controller has no reference position",
                     "Look whether the way is free, then home the axis (acquire home)",
                 )

@@ -16,7 +16,7 @@ from processing.maps.means import mean_of
 from processing.maps.region import parse_region
 from processing.steps.reduction import Reduction
 from processing.storage.captures.capture import Capture
-from processing.storage.captures.schema import CaptureHeader, create_layout, write_closing
+from processing.storage.captures.schema import CaptureHeader, create_layout, position_column, write_closing
 from processing.storage.products.product import Product, is_product, leading_dimensions
 
 if TYPE_CHECKING:
@@ -286,9 +286,9 @@ def write_dataset(dataset: xr.Dataset, path: Path | str) -> Path:
     counts = dataset["counts"].to_numpy()
     header = _header(dataset)
     angles = {
-        str(name).removesuffix("_deg"): np.asarray(column, dtype=float)
+        str(name).rpartition("_")[0]: np.asarray(column, dtype=float)
         for name, column in dataset.coords.items()
-        if str(name).endswith("_deg") and column.dims == ("state",)
+        if str(name).endswith(("_deg", "_V")) and column.dims == ("state",)
     }
     n = len(counts)
     role = tuple(dataset["role"].to_numpy().astype(str)) if "role" in dataset.coords else ("sample",) * n
@@ -349,7 +349,8 @@ def _of_capture(path: Path) -> xr.Dataset:
             "time": ("state", column["host_time_s"], {"units": "s", "long_name": "when the frame came, host clock"}),
         }
         for axis, values in capture.angles_deg.items():
-            coords[f"{axis}_deg"] = ("state", values, {"units": "degree", "long_name": f"{axis}, as read back"})
+            name, units = position_column(axis, axis in capture.header.voltages)
+            coords[name] = ("state", values, {"units": units, "long_name": f"{axis}, as read back"})
         attributes = {"units": "count", "long_name": "counts as stored"}
         variables = {"counts": (("state", "channel", "y", "x"), counts, attributes)}
         # What was cut apart here is channels from now on.

@@ -79,6 +79,7 @@ def states_of(opened: Capture) -> dict[str, Any]:
         "number": [int(k) for k in opened.done],
         "role": list(opened.role),
         "angles_deg": {name: _plain(values) for name, values in opened.angles_deg.items()},
+        "voltages": list(opened.header.voltages),
         "exposure_s": _plain(opened.column("exposure_s")),
         "saturated_fraction": _plain(opened.column("saturated_fraction")),
         "channels": list(opened.header.channels),

@@ -11,6 +11,7 @@ from acquisition.bluesky_devices.device import BlueskyDevice, Readings, data_key
 from acquisition.bluesky_devices.frames_in_files import FRAME, Documents, asset_documents, in_file, write_frame
 from acquisition.bluesky_devices.status import MoveStatus, in_background
 from acquisition.errors import AcquisitionError
+from processing.storage.captures.schema import position_column
 
 
 class AxisDevice(BlueskyDevice):
@@ -52,8 +53,9 @@ class AxisDevice(BlueskyDevice):
         return readings({self.name: self.position})
 
     def describe(self) -> Readings:
-        """Unit and source of the angle."""
-        return {self.name: data_key(f"axis {self.name}, as read back", (), "degree")}
+        """Unit and source of the position."""
+        _, unit = position_column(self.name, self.rig.axes[self.name].config.unit == "V")
+        return {self.name: data_key(f"axis {self.name}, as read back", (), unit)}
 
 
 class CameraDevice(BlueskyDevice):

@@ -24,7 +24,7 @@ from acquisition.errors import AcquisitionError
 from acquisition.rig.rig import Rig
 from acquisition.stop_request import StopRequest
 from processing.storage.captures.capture import Capture
-from processing.storage.captures.schema import COLUMN_UNITS
+from processing.storage.captures.schema import COLUMN_UNITS, position_column
 
 #: Columns of the file that tell of each state, beside the angles.
 COLUMNS = ("exposure_s", "host_time_s", "monitor", "saturated_fraction")
@@ -160,6 +160,9 @@ class CaptureDevice(BlueskyDevice):
         """End after the state that is being taken; the file can be gone on with by `acquire --resume`."""
         self._stop.request()
 
+    def _column(self, axis: str) -> tuple[str, str]:
+        return position_column(f"{self.name}_{axis}", self.rig.config.axes[axis].unit == "V")
+
     def _sealed(self) -> Path:
         if self._path is None:
             raise AcquisitionError(f"{self.name} has taken no capture yet; trigger it first.")
@@ -169,7 +172,7 @@ class CaptureDevice(BlueskyDevice):
         """File, angles as read back and columns, of the capture that was taken last."""
         with Capture(self._sealed()) as capture:
             values: dict[str, Any] = {f"{self.name}_file": str(capture.path)}
-            values |= {f"{self.name}_{axis}_deg": angles for axis, angles in capture.angles_deg.items()}
+            values |= {self._column(axis)[0]: angles for axis, angles in capture.angles_deg.items()}
             values |= {f"{self.name}_{column}": capture.column(column) for column in COLUMNS}
         return readings(values)
 
@@ -178,7 +181,8 @@ class CaptureDevice(BlueskyDevice):
         states = (len(self._job.table),)
         keys = {f"{self.name}_file": {"source": "capture file", "dtype": "string", "shape": []}}
         for axis in self._job.table.angles_deg:
-            keys[f"{self.name}_{axis}_deg"] = data_key(f"axis {axis}, as read back in each state", states, "degree")
+            name, unit = self._column(axis)
+            keys[name] = data_key(f"axis {axis}, as read back in each state", states, unit)
         keys |= {f"{self.name}_{c}": data_key(c, states, COLUMN_UNITS.get(c, "")) for c in COLUMNS}
         settings = self.rig.require_camera().settings
         frames = data_key("counts", (*states, 1, settings.height or 0, settings.width or 0), "count")

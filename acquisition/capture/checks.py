@@ -75,7 +75,11 @@ def check_plan(plan: MeasurementPlan, rig: RigConfig) -> list[CheckResult]:
     checks.append(_member("wavelength_nm", f"{plan.wavelength_nm:g}", known))
     if rig.simulator is not None:
         checks.append(_member("sample", plan.sample.name or plan.sample.kind, sorted(rig.simulator.samples)))
-    missing = sorted(set(plan.states.angles_deg()) - set(rig.axes))
+    try:
+        turning = plan.states.angles_deg(rig.named_states())
+    except ConfigError as error:
+        return [*checks, CheckResult("states", False, str(error))]
+    missing = sorted(set(turning) - set(rig.axes))
     checks.append(
         CheckResult(
             "axes", not missing, f"the rig has no axis {', '.join(missing)}" if missing else ", ".join(rig.axes)
@@ -105,6 +109,10 @@ def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) 
     if lacking:
         found = f"instrument {instrument.name!r} turns with {', '.join(lacking)}, the plan does not"
         return [*checks, CheckResult("instrument", False, found)]
+    volts = [a for a, column in table.angles_deg.items() if rig.axes[a].unit == "V" and np.ptp(column) > 0]
+    if ignored := sorted(set(volts) - set(instrument.axes)):
+        found = f"instrument {instrument.name!r} does not depend on the voltage of {', '.join(ignored)}, which changes"
+        return [*checks, CheckResult("instrument", False, f"{found}. Give its W in the instrument file (`measured`)")]
     if len(instrument.channels) > 1 and instrument.mosaic is None and instrument.beams is None:
         found = f"{len(instrument.channels)} channels on one camera: the instrument file says by `beams` where they lie"
         return [*checks, CheckResult("instrument", False, found)]
@@ -173,7 +181,7 @@ def check_devices(
         except LimitError as error:
             checks.append(CheckResult(f"limits of {axis}", False, str(error) + _could_fold(axis, rig)))
         else:
-            ends = f"{column.min():g} to {column.max():g} deg"
+            ends = f"{column.min():g} to {column.max():g} {rig.config.axes[axis].unit}"
             checks.append(CheckResult(f"limits of {axis}", True, ends))
     checks.append(_check_first_move(table, rig, state, rig.where_once_homed() if here_deg is None else here_deg))
     checks += _check_park(rig)

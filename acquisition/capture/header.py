@@ -42,6 +42,7 @@ def capture_header(
         versions=versions(),
         seed=seed,
         folded_deg=dict(config.fold_deg),
+        voltages={axis: dict(entry.named_states()) for axis, entry in config.axes.items() if entry.unit == "V"},
         camera_nodes=camera.node_map(),
         colours=colours_of(instrument, camera),
     )

@@ -79,7 +79,7 @@ def prepare(plan: MeasurementPlan, rig: RigConfig, read: ReadInstrument = Instru
     refuse_failed(checks)
     instrument = load_instrument(plan, rig, read)
     chosen = plan.exposure_s if isinstance(plan.exposure_s, float) else plan.exposure_s.start_s
-    table = plan.state_table(standing_pose_deg(plan, rig), chosen)
+    table = plan.state_table(standing_pose_deg(plan, rig), chosen, rig.named_states())
     checks += check_table(table, rig, instrument)
     refuse_failed(checks)
     seed = rig.simulator.seed if rig.simulator else None

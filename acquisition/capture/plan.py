@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ from processing.yaml_words import NAME_PATTERN, mistakes_of, words_of
 
 #: Name of a mode of the rig file; file names of captures hold it.
 Mode = Annotated[str, Field(pattern=NAME_PATTERN)]
+
+#: For each axis its positions by their names.
+NamedStates: TypeAlias = Mapping[str, Mapping[str, float]]
 
 #: The axis that sets Omega, where the rig has one.
 ARM = "arm"
@@ -48,7 +51,7 @@ class RotatingRetarders(FiniteSection):
         default=("psg", "psa"), description="names of the generator's and the analyzer's axis"
     )
 
-    def angles_deg(self) -> dict[str, NDArray[np.float64]]:
+    def angles_deg(self, named: NamedStates) -> dict[str, NDArray[np.float64]]:
         """Target angles of each axis (states,), degrees."""
         return dict(rotating_retarders(1.0, self.states, self.step_deg, self.ratio, axes=self.axes).angles_deg)
 
@@ -59,17 +62,18 @@ class FixedPose(FiniteSection):
     kind: Literal["fixed"] = "fixed"
     states: int = Field(default=8, gt=0, le=10_000, description="number of frames in the one pose")
 
-    def angles_deg(self) -> dict[str, NDArray[np.float64]]:
+    def angles_deg(self, named: NamedStates) -> dict[str, NDArray[np.float64]]:
         """No axis of its own."""
         return {}
 
 
 class ListedStates(FiniteSection):
-    """Any table: a list of angles for each axis, all of one length."""
+    """Any table: a list of angles for each axis, all of one length; of a liquid crystal volts, or names of states."""
 
     kind: Literal["table"]
-    angles: dict[str, tuple[Annotated[float, Field(allow_inf_nan=False)], ...]] = Field(
-        description="for each axis its angle in each pose, degrees; all lists of one length"
+    angles: dict[str, tuple[Annotated[float, Field(allow_inf_nan=False)] | str, ...]] = Field(
+        description="for each axis its angle in each pose, degrees; for a liquid crystal volts, or names of its "
+        "`states` in the rig file; all lists of one length"
     )
 
     @model_validator(mode="after")
@@ -84,9 +88,16 @@ class ListedStates(FiniteSection):
         """Number of states."""
         return len(next(iter(self.angles.values())))
 
-    def angles_deg(self) -> dict[str, NDArray[np.float64]]:
-        """Target angles of each axis (states,), degrees."""
-        return {name: np.asarray(column, dtype=float) for name, column in self.angles.items()}
+    def angles_deg(self, named: NamedStates) -> dict[str, NDArray[np.float64]]:
+        """Target angles of each axis (states,), degrees or volts. Raises ConfigError for a name that is not there."""
+
+        def number(axis: str, target: float | str) -> float:
+            known = named.get(axis, {})
+            if isinstance(target, str) and target not in known:
+                raise ConfigError(f"axis {axis} has no state {target!r}, only: {', '.join(known) or 'none'}")
+            return known[target] if isinstance(target, str) else target
+
+        return {axis: np.array([number(axis, target) for target in column]) for axis, column in self.angles.items()}
 
 
 States = Annotated[RotatingRetarders | FixedPose | ListedStates, Field(discriminator="kind")]
@@ -172,7 +183,9 @@ class MeasurementPlan(FiniteSection):
             lines = [": ".join(filter(None, (".".join(map(str, e["loc"])), words_of(e)))) for e in mistakes_of(error)]
             raise ConfigError("\n".join(lines)) from error
 
-    def state_table(self, pose_deg: Mapping[str, float], exposure_s: float) -> StateTable:
+    def state_table(
+        self, pose_deg: Mapping[str, float], exposure_s: float, named: NamedStates | None = None
+    ) -> StateTable:
         """Rows of the capture: darks in the first pose, then the sample states.
 
         Parameters
@@ -181,8 +194,10 @@ class MeasurementPlan(FiniteSection):
             Angle of every axis that stands still during the capture (the arm, a Stokes pose).
         exposure_s
             Exposure of every state in seconds, times the factors of the bracket.
+        named
+            Positions by their names, for each axis that has names.
         """
-        turning = self.states.angles_deg()
+        turning = self.states.angles_deg(named or {})
         if self.repeat_first:
             turning = {name: np.append(column, column[0]) for name, column in turning.items()}
         n, factors = self.states.states + self.repeat_first, len(self.bracket)

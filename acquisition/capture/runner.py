@@ -363,12 +363,12 @@ class CaptureRunner:
             before, start = self._rested.get(axis), motion.start
             if before is None or start is None:
                 continue
-            off = start.deg - before.deg
+            off, unit = start.deg - before.deg, self.rig.axes[axis].config.unit
             if abs(off) > self.rig.axes[axis].config.tolerance_deg:
                 raise RunFailed(
-                    f"state {state}: axis {axis} rested at {before.deg:.4f} deg in the state before and reads "
-                    f"{start.deg:.4f} deg before its next move: its controller restarted, or something turned it. Home "
-                    f"it (acquire home {axis}), then continue with --resume."
+                    f"state {state}: axis {axis} rested at {before.deg:.4f} {unit} in the state before and reads "
+                    f"{start.deg:.4f} {unit} before its next move: its controller restarted, or something turned it. "
+                    f"Home it (acquire home {axis}), then continue with --resume."
                 )
 
     def _again(self, state: int, error: FrameLost) -> None:
@@ -385,11 +385,11 @@ class CaptureRunner:
 
     def _require_on_target(self, state: int, targets: Mapping[str, float], positions: Mapping[str, Position]) -> None:
         for axis, target in targets.items():
-            off = positions[axis].deg - target
+            off, unit = positions[axis].deg - target, self.rig.axes[axis].config.unit
             if abs(off) > self.rig.axes[axis].config.tolerance_deg:
                 raise RunFailed(
-                    f"state {state}: axis {axis} should stand at {target:.4f} deg and reads "
-                    f"{positions[axis].deg:.4f} deg after it had arrived. Something moved it; the state is not kept."
+                    f"state {state}: axis {axis} should stand at {target:.4f} {unit} and reads "
+                    f"{positions[axis].deg:.4f} {unit} after it had arrived. Something moved it; the state is not kept."
                 )
 
     def _discard(self, state: int, why: str) -> None:

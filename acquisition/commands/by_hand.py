@@ -100,7 +100,7 @@ def _require_consent(config: RigConfig, yes: bool) -> None:
 
 def move(
     axis: Annotated[str, typer.Argument(help="axis of the rig file")],
-    degrees: Annotated[float, typer.Argument(help="absolute angle")],
+    degrees: Annotated[float, typer.Argument(help="absolute angle; of a liquid crystal volts")],
     rig: RigFile = None,
     home_first: Annotated[bool, typer.Option("--home", help="home the axis if it has no reference")] = False,
 ) -> None:
@@ -118,11 +118,12 @@ def move(
         Console(stderr=True).status("") as status,
     ):
         live.axes[axis].check(degrees)
+        unit = live.axes[axis].config.unit
         if (home_first or config.home_at_start) and axis in live.unhomed():
             status.update(f"homing {axis}; Ctrl-C stops it")
             live.home([axis])
-        status.update(f"moving {axis} to {degrees:g} deg; Ctrl-C stops it")
-        typer.echo(f"{axis} at {live.move({axis: degrees})[axis].deg:.4f} deg")
+        status.update(f"moving {axis} to {degrees:g} {unit}; Ctrl-C stops it")
+        typer.echo(f"{axis} at {live.move({axis: degrees})[axis].deg:.4f} {unit}")
     _say_ended(config)
 
 

@@ -118,7 +118,7 @@ def _axis(axis: MotionAxis) -> str:
     axis.check_fault()
     homed = "homed" if axis.is_homed() else "NOT homed"
     moving = ", MOVING" if axis.is_moving() else ""
-    position = f"at {axis.read_position().deg:.4f} deg, " if axis.is_homed() else ""
+    position = f"at {axis.read_position().deg:.4f} {axis.config.unit}, " if axis.is_homed() else ""
     warnings = "".join(f", warning: {text}" for text in axis.warnings())
     stop = "" if axis.can_stop_a_move else ", cannot be stopped once it moves"
     name = f"{who.kind} {who.model}, serial {who.serial_number}, firmware {who.firmware}"

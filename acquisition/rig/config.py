@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -38,6 +39,10 @@ class RigConfig(RigSections):
         if valid is None or wrong:
             raise ValidationError.from_exception_data(cls.__name__, [_details(where, why) for where, why in wrong])
         return valid
+
+    def named_states(self) -> dict[str, Mapping[str, float]]:
+        """For each axis that has names for its positions, these."""
+        return {name: named for name, entry in self.axes.items() if (named := entry.named_states())}
 
     @model_validator(mode="after")
     def _own_emulators_are_simulated(self) -> Self:

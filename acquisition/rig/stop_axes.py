@@ -154,7 +154,7 @@ def _rests(axis: MotionAxis, tell: Tell) -> bool:
                 tell(f"{axis.name}: stop sent, STILL MOVING{note}. Switch its power off")
                 return False
             axis.clock.sleep_s(axis.config.poll_s)
-        where = f"at {axis.read_position().deg:.4f} deg" if axis.is_homed() else "without a reference"
+        where = f"at {axis.read_position().deg:.4f} {axis.config.unit}" if axis.is_homed() else "without a reference"
     except DeviceError as error:
         tell(f"{axis.name}: stop sent, then {error}")
         return False

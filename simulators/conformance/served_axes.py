@@ -69,12 +69,13 @@ class AxisTests:
 
 
 def motion_kinds(axes: int = 1) -> list[str]:
-    """Emulators of motion controllers, those of plug-ins too, that can serve so many axes."""
+    """Emulators of controllers whose axes turn, those of plug-ins too, that can serve so many axes."""
     kinds = []
     for kind, make in served_kinds().items():
         # A controller of one axis refuses to be made with more.
         with contextlib.suppress(ValueError):
-            if len(axis_configs(make(ServeOptions(axes=axes)), "none")) == axes:
+            configs = axis_configs(make(ServeOptions(axes=axes)), "none")
+            if len(configs) == axes and all(config.unit == "deg" for config in configs):
                 kinds.append(kind)
     return kinds
 

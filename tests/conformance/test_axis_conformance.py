@@ -38,8 +38,8 @@ def test_every_kind_of_axis_has_an_emulator() -> None:
         for kind in motion_kinds()
         for config in axis_configs(served_kinds()[kind](ServeOptions()), "none")
     }
-    # A stage of Micro-Manager has no wire: tests/conformance/test_mmcore.py.
-    assert covered | {"mmcore"} == set(device_kinds("axes"))
+    # A stage of Micro-Manager has no wire, a liquid crystal has volts: tests/conformance/test_mmcore.py, test_lcc25.py.
+    assert covered | {"mmcore", "lcc25"} == set(device_kinds("axes"))
 
 
 def test_a_config_that_names_no_device_is_refused_when_it_is_written() -> None:

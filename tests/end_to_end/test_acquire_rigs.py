@@ -21,7 +21,8 @@ PLAN = "kind: plan\nstates: {kind: rotating_retarders, states: 16, step_deg: 9, 
 
 def _kinds() -> list[str]:
     """Kinds of motion controllers, as `simulate serve` finds them."""
-    return [kind for kind, make in served_kinds().items() if axis_configs(make(ServeOptions()), "none")]
+    entries = {kind: axis_configs(make(ServeOptions()), "none") for kind, make in served_kinds().items()}
+    return [kind for kind, found in entries.items() if found and found[0].unit == "deg"]
 
 
 class RigMaker:

@@ -336,5 +336,23 @@ def test_instrumentkit_esp301() -> None:
         wait_until("target", lambda: axis.is_motion_done)
         axis.move(-5, absolute=False)
         wait_until("target", lambda: axis.is_motion_done)
-        assert float(axis.position) == emulator.true_deg(0) == 15.0
-        assert float(axis.right_limit) == 180.0
+        assert axis.position.magnitude == emulator.true_deg(0) == 15.0
+        assert axis.right_limit.magnitude == 180.0
+
+
+def test_instrumentkit_lcc25() -> None:
+    package = pytest.importorskip("instruments")
+    with served("lcc25") as (emulator, path):
+        box = package.thorlabs.LCC25.open_serial(path, 115_200, timeout=1)
+        assert "LCC25" in box.name
+        box.mode = box.Mode.voltage1
+        box.voltage1 = 1.5
+        assert emulator.true_deg() == 0.0
+        box.enable = True
+        wait_until("voltage", lambda: emulator.true_deg() == 1.5)
+        box.voltage2 = 4.0
+        box.mode = box.Mode.voltage2
+        assert (box.voltage1.magnitude, box.voltage2.magnitude, box.enable) == (1.5, 4.0, True)
+        wait_until("voltage", lambda: emulator.true_deg() == 4.0)
+        box.frequency = 60
+        assert box.frequency.magnitude == 60.0

@@ -68,7 +68,8 @@ async function drawHistogram() {
 }
 
 function told(k) {
-  const angles = Object.entries(states.angles_deg).map(([name, values]) => `${name} ${values[k] === null ? "?" : (((values[k] % 360) + 360) % 360).toFixed(2)}°`);
+  const position = (name, value) => states.voltages.includes(name) ? `${value.toFixed(3)} V` : `${(((value % 360) + 360) % 360).toFixed(2)}°`;
+  const angles = Object.entries(states.angles_deg).map(([name, values]) => `${name} ${values[k] === null ? "?" : position(name, values[k])}`);
   const more = narrow() ? [] : [...angles, `${states.exposure_s[k] ?? "?"} s`];
   byId("which").textContent = [`state ${states.number[k]}`, states.role[k], ...more].join(", ");
 }

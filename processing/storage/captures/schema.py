@@ -158,6 +158,8 @@ class CaptureHeader(FiniteSection):
     seed: int | None = Field(default=None, ge=0, lt=1 << 63)
     #: Axes whose targets were moved into their travel by whole multiples of so many degrees.
     folded_deg: dict[str, float] = Field(default_factory=dict)
+    #: Axes whose positions are volts, with the positions that have a name.
+    voltages: dict[Line, dict[Line, float]] = Field(default_factory=dict)
     #: Every feature of the camera with its value when the capture began; in a note of its own, not in header_json.
     camera_nodes: dict[str, str] = Field(default={}, exclude=True)
     #: Colour before each pixel from the first of the frames on, for a sensor with a colour filter.
@@ -206,7 +208,7 @@ def create_layout(
     if header.omega_deg is not None:
         _quantity(instrument, "omega_deg", header.omega_deg, "degree")
     for axis, target in target_deg.items():
-        _positioner(entry, axis, np.asarray(target, dtype=np.float64))
+        _positioner(entry, axis, np.asarray(target, dtype=np.float64), header.voltages.get(axis))
     create = frames or partial(_allocated, chunks=(1, 1, *frame_shape))
     _detector(entry, header, create(entry["instrument/detector"], "data", (n, c, *frame_shape), dtype))
 
@@ -230,7 +232,8 @@ def create_layout(
         note["type"] = f"application/{kind}"
         # As bytes, which is what a note holds for NeXus.
         _put_text(note, "data", text.encode())
-    _plot(entry, header.title, tuple(target_deg))
+    positions = {position_column(axis, axis in header.voltages)[0]: axis for axis in target_deg}
+    _plot(entry, header.title, positions)
 
 
 def reserve_texts(entry: h5py.Group, begin: bytes) -> dict[h5py.Dataset, int]:
@@ -261,17 +264,24 @@ def _put_text(group: h5py.Group, name: str, raw: bytes) -> None:
     group.create_dataset(name, data=raw, dtype=h5py.string_dtype("utf-8", max(len(raw), 1)))
 
 
-def _positioner(entry: h5py.Group, axis: str, target_deg: NDArray[np.float64]) -> None:
-    """An axis: where it was to be and where it was, in each state."""
+def _positioner(
+    entry: h5py.Group, axis: str, target_deg: NDArray[np.float64], voltages: Mapping[str, float] | None
+) -> None:
+    """An axis: where it was to be and where it was, in each state; of volts with the names that they have."""
     positioner = add_group(entry["instrument"], axis, "NXpositioner")
     positioner["name"] = axis
     _column(positioner, "value", len(target_deg), np.float64, fill=np.nan)
     _column(positioner, "raw_value", len(target_deg), np.float64, fill=np.nan)
     positioner.create_dataset("target_value", data=target_deg)
-    for name, units in (("value", "degree"), ("raw_value", "count"), ("target_value", "degree")):
+    _, unit = position_column(axis, voltages is not None)
+    for name, units in (("value", unit), ("raw_value", "count"), ("target_value", unit)):
         positioner[name].attrs["units"] = units
         attach(positioner[name], entry, ["state"])
     positioner["value"].attrs["long_name"] = f"{axis}, as read back"
+    if voltages:
+        named = {volts: name for name, volts in voltages.items()}
+        positioner["state_name"] = np.array([named.get(volts, "").encode() for volts in target_deg.tolist()], dtype="S")
+        attach(positioner["state_name"], entry, ["state"])
 
 
 def _detector(entry: h5py.Group, header: CaptureHeader, frames: h5py.Dataset) -> None:
@@ -291,15 +301,20 @@ def _detector(entry: h5py.Group, header: CaptureHeader, frames: h5py.Dataset) ->
             detector[key].attrs["units"] = units
 
 
-def _plot(entry: h5py.Group, title: str, axes: tuple[str, ...]) -> None:
-    """The default plot: the frames over state, channel and pixel, with the angles as further coordinates."""
+def position_column(axis: str, is_voltage: bool) -> tuple[str, str]:
+    """What labelled data and documents call the positions of an axis, and their unit."""
+    return (f"{axis}_V", "V") if is_voltage else (f"{axis}_deg", "degree")
+
+
+def _plot(entry: h5py.Group, title: str, positions: Mapping[str, str]) -> None:
+    """The default plot: the frames over state, channel and pixel, with the axes' positions as further coordinates."""
     data = add_group(entry, "data", "NXdata")
     dimensions = ("state", "channel", *PIXEL_AXES)
     for name in dimensions:
         data[name] = entry[name]
     data["data"] = h5py.SoftLink("/entry/instrument/detector/data")
     default_plot(data, "data", dimensions, title)
-    further = {f"{axis}_deg": f"/entry/instrument/{axis}/value" for axis in axes}
+    further = {name: f"/entry/instrument/{axis}/value" for name, axis in positions.items()}
     further |= {name: f"/entry/states/{name}" for name in ("role", "exposure_s", "host_time_s", "done")}
     for name, target in further.items():
         link_coordinate(data, name, target, dimensions.index("state"))
