@@ -356,3 +356,17 @@ def test_instrumentkit_lcc25() -> None:
         wait_until("voltage", lambda: emulator.true_deg() == 4.0)
         box.frequency = 60
         assert box.frequency.magnitude == 60.0
+
+
+def test_oriel_cornerstone() -> None:
+    package = pytest.importorskip("oriel_cornerstone_260.monochromator")
+    with served("cornerstone") as (emulator, path):
+        instrument = package.Monochromator(path)
+        assert "Cornerstone 260" in instrument.info
+        assert instrument.goto(662.0) == emulator.wavelength_nm == 662.0
+        assert instrument.shuttered
+        instrument.shutter(close=False)
+        assert (instrument.shuttered, emulator.light_at(662.0)) == (False, 1.0)
+        instrument.set_grating(2)
+        assert instrument.grating == {"number": 2, "lines": 1200, "label": "VIS"}
+        assert instrument.slit_width(1, 250) == 250
