@@ -30,7 +30,7 @@ class RecordedAxis:
 
     def __init__(self, rig: RecordedRig, name: str) -> None:
         self.rig, self.name = rig, name
-        self.config = SimpleNamespace(tolerance_deg=0.01)
+        self.config = SimpleNamespace(tolerance_deg=0.01, unit="deg")
         self.deg = self.off_deg = 0.0
 
     def move_time_s(self, distance_deg: float) -> float:

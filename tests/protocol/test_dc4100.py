@@ -31,7 +31,7 @@ def wire(pairs: list[tuple[str, str]]) -> list[tuple[bytes, bytes]]:
 
 
 def opened(path: str, lines: LineRegistry) -> dc4100.Dc4100:
-    return dc4100.open(dc4100.Config(port=path, reply_s=0.3), lines)
+    return dc4100.open(dc4100.Config(port=path), lines)
 
 
 @pytest.mark.parametrize(

@@ -37,9 +37,11 @@ def test_zaber_motion() -> None:
             arm.move_absolute(10**8)
 
 
-def test_pylablib_elliptec() -> None:
+def test_pylablib_elliptec(monkeypatch: pytest.MonkeyPatch) -> None:
     from pylablib.devices import Thorlabs
 
+    # It looks for modules for half a second of real time, which a busy machine may take for one answer.
+    monkeypatch.setattr(Thorlabs.ElliptecMotor._detect_devices, "__defaults__", ("all", 10.0, 0.1))
     with served("elliptec") as (emulator, path):
         motor = Thorlabs.ElliptecMotor(path, addrs=[0, 1], scale="stage")
         try:
