@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
 
@@ -304,6 +305,8 @@ def test_exported_maps_have_the_colours_of_the_reports(exported, monkeypatch):
 
     from processing.reports import figure_style
 
+    # Imported by a later test, this module would keep the function of this one.
+    importlib.import_module("processing.reports.figures")
     drawn = []
     monkeypatch.setattr(figure_style, "grid_figure", lambda panels, *_: drawn.extend(panels) or Figure())
     exported("product", "--to", "png", "--plane", "mueller", "--plane", "mueller_errors")
