@@ -202,3 +202,14 @@ def test_a_wave_of_any_frequency_is_no_fault_of_the_plate(fault, seed, configs, 
     """Two waves of the grid, or the plate's own, explain a part of a wave between them."""
     fault(bench, np.random.default_rng(seed), STATES)
     assert set(sure(diagnosed(tmp_path, configs, bench))) <= {"source_flicker"}
+
+
+def test_a_name_beside_a_fault_without_one_is_likely(configs, tmp_path, bench):
+    """An unknown mechanism has more parts than its sentence, and effects of the list describe them as well."""
+    turn = 2 * np.pi / STATES
+    bench.shift.append(lambda k, a: (0.1 * np.cos(turn * k), 0.1 * np.sin(turn * k)))
+    assert sure(diagnosed(tmp_path, configs, bench)) == ["beam_wander"]
+    bench.retardance.append(lambda k, a: (0.0, np.deg2rad(1.5) * np.cos(2 * 4.91 * turn * k - 0.4)))
+    found = diagnosed(tmp_path, configs, bench)
+    assert {e.kind: e.answer for e in found.effects} == {"unlisted": "unlisted", "beam_wander": "likely"}
+    assert found.verdict == "explained"

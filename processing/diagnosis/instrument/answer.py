@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.doubts import PART_OF_LEFT
+from processing.diagnosis.instrument.doubts import PARTS
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES, features
 from processing.diagnosis.instrument.mueller_error import MuellerErrors, UncertainMueller
 from processing.diagnosis.instrument.problem import InstrumentProblem
@@ -268,12 +268,12 @@ def told_effects(
 
 
 def told_answer(cause: Cause, doubt: str | None) -> tuple[Answer, float]:
-    """The word for a cause and its probability: what may be a part of what is left is not sure, what else is doubted is
-    not told."""
+    """The word for a cause and its probability: what may be a part of something else is not sure, what is doubted for
+    another reason is not told."""
     if doubt is None:
         return cause.answer, cause.probability
     probability = min(cause.probability, DOUBTED)
-    if doubt != PART_OF_LEFT or cause.probability < SURE:
+    if doubt not in PARTS or cause.probability < SURE:
         return "unknown", min(probability, LIKELY)
     return "one of" if cause.alternatives else "unlisted" if cause.candidates[0].price else "likely", probability
 

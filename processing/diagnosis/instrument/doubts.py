@@ -45,8 +45,10 @@ ELSE = (STANDS, NOT_ALIKE)
 #: that may be a part of it.
 OF_THE_SAMPLE = "it differs from part to part of the image, which a source does not"
 CHANGED = (OF_THE_SAMPLE,)
-#: The one reason that leaves a name likely.
+#: Reasons that leave a name likely.
 PART_OF_LEFT = "it may be a part of what is left unexplained"
+PART_OF_UNLISTED = "it may be a part of the fault that has no name"
+PARTS = (PART_OF_LEFT, PART_OF_UNLISTED)
 
 
 def doubts(
@@ -77,6 +79,10 @@ def doubts(
         # What is uneven is another cause, and smaller effects beside it may be parts of it.
         if cause not in out and cause.log_odds < uneven:
             out[cause] = "it may be a part of what is uneven over the image"
+    # A sentence is a part of an unknown mechanism, whose other parts look like effects of the list.
+    unlisted = [k for k in range(len(found.members)) if found.label(k).price]
+    if found.samples.any_of(unlisted) > 0.5:
+        out |= {cause: PART_OF_UNLISTED for cause in causes if cause not in out and cause.answer != "unlisted"}
     return out
 
 
