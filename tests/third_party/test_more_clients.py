@@ -370,3 +370,15 @@ def test_oriel_cornerstone() -> None:
         instrument.set_grating(2)
         assert instrument.grating == {"number": 2, "lines": 1200, "label": "VIS"}
         assert instrument.slit_width(1, 250) == 250
+
+
+def test_instrumentkit_sc10() -> None:
+    package = pytest.importorskip("instruments")
+    with served("sc10") as (emulator, path):
+        box = package.thorlabs.SC10.open_serial(path, 9600, timeout=1)
+        assert (box.enable, box.closed, box.interlock) == (False, True, False)
+        box.mode = box.Mode.manual
+        box.enable = True
+        wait_until("blade", lambda: emulator.is_open())
+        box.open_time, box.repeat = 500, 3
+        assert (box.closed, box.open_time.magnitude, box.repeat, box.baud_rate) == (False, 500, 3, 9600)
