@@ -104,7 +104,7 @@ class TestLCC25(EmulatorNoise):
 
     def test_an_output_that_somebody_switches_off_ends_the_move(self) -> None:
         with self.served("lcc25") as served:
-            axis = served.open(settle_s=0.3, margin_s=0.1)
+            axis = served.open(settle_s=0.3, margin_s=2.0)
             motion = axis.start_move(2.0)
             served.emulator.receive(b"enable=0\r")
             with pytest.raises(MotionFailed, match=r"move to 2.0000 V: .* off its target by -2.0000 V") as caught:
@@ -139,6 +139,7 @@ def crystal_rig(small_rig: Callable[..., Path], tmp_path: Path) -> Path:
 PLAN = "kind: plan\nmode: stokes\nsample: {name: air, kind: air}\nomega_deg: 180\ndarks: 1\n"
 
 
+@pytest.mark.long
 def test_a_capture_of_named_states(
     crystal_rig: Path,
     tmp_path: Path,
