@@ -22,6 +22,7 @@ from processing.campaign.tasks import CaptureMeasure, CaptureTask, locate, measu
 from processing.computing.blas import one_blas_thread
 from processing.errors import NotDetermined
 from processing.geometry.viewing import ViewingGeometry
+from processing.instrument.uncertainty import of_all_inputs
 from processing.reduction.mueller import Progress
 from processing.reflectance.tables import ScatteringTable
 from processing.storage.products.provenance import Step, file_identity
@@ -222,7 +223,7 @@ def compare_on_sphere(
     """Deviation of two xi0 tables on a virtual object (Jarecki and Kupinski, Sec. V-B): `xi0_percent`, what noise and
     the instruments' uncertainties make of it, `common`.
 
-    Tables with the same uncertain inputs are of one instrument, whose error their difference shares. Raises
+    The errors of one instrument are in the difference as far as they differ; those of two add as squares. Raises
     NotDetermined when the object is not in the frame.
     """
     image = view.at(omega_deg, *shape)
@@ -235,8 +236,8 @@ def compare_on_sphere(
         return {"common": 0.0}
     noise = [table.lookup(angles, of=table.uncertainties["u_noise"])[0, both] for table in tables]
     moved = [table.lookup(angles, of=table.directions)[:, 0, both] for table in tables]
-    shared = reference.inputs == other.inputs
-    parts = {"": [(b - a)[both]], "noise_": noise, "systematic_": [moved[1] - moved[0]] if shared else moved}
+    _, aligned = of_all_inputs([table.inputs for table in tables], moved)
+    parts = {"": [(b - a)[both]], "noise_": noise, "systematic_": [aligned[1] - aligned[0]]}
     found = {f"xi0_{name}percent": 100 * _size(part) for name, part in parts.items()}
     return found | {"common": float(both.mean())}
 

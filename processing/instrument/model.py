@@ -6,6 +6,7 @@ fixed or turned by a named axis, and one or more detector channels (docs/convent
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -169,6 +170,12 @@ class InstrumentModel(Section):
     def load(cls, path: Path | str) -> InstrumentModel:
         """Read an instrument file. Raises ConfigError with file, line and key."""
         return load_yaml(path, cls)
+
+    @property
+    def identity(self) -> str:
+        """Name and a checksum of everything stated: two instruments whose values have equal names are two."""
+        stated = self.model_dump_json(exclude={"wavelengths_nm"}, exclude_defaults=True)
+        return f"{self.name.replace(';', ',')} {hashlib.sha256(stated.encode()).hexdigest()[:6]}"
 
     @property
     def projects_source(self) -> bool:

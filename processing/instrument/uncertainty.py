@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from processing.arrays import Array
 from processing.instrument.elements import number
 from processing.instrument.model import InstrumentModel
 
@@ -48,6 +49,24 @@ def value_directions(model: InstrumentModel) -> Iterator[ValueDirection]:
             if size > 0:
                 shift = dict(zip(names, (np.sqrt(size) * direction).tolist(), strict=True))
                 yield ValueDirection(" & ".join(names), np.nan, _moved(model, shift))
+
+
+def of_all_inputs(inputs: Sequence[tuple[str, ...]], moves: Sequence[Array]) -> tuple[tuple[str, ...], list[Array]]:
+    """What the inputs of all instruments do to each of several results, zero where the instrument is another.
+
+    Parameters
+    ----------
+    inputs : of each result; those of one name are one, see `InstrumentModel.identity`.
+    moves : (D, ...) of each, by its own inputs.
+    """
+    if all(own == inputs[0] for own in inputs):
+        return inputs[0], list(moves)
+    every = tuple(dict.fromkeys(name for own in inputs for name in own))
+    found = []
+    for own, moved in zip(inputs, moves, strict=True):
+        found.append(np.zeros((len(every), *moved.shape[1:])))
+        found[-1][[every.index(name) for name in own]] = moved
+    return every, found
 
 
 def _moved(model: InstrumentModel, shifts: Mapping[str, float]) -> InstrumentModel:

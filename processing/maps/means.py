@@ -18,6 +18,7 @@ from scipy.special import stdtrit
 
 from processing.arrays import Array
 from processing.errors import ProcessError
+from processing.instrument.uncertainty import of_all_inputs
 from processing.maps.intervals import ANGLES, EITHER_AXIS
 from processing.maps.partial_quantities import determined_maps, partial_block
 from processing.maps.quantities import quantities_block
@@ -135,19 +136,21 @@ def mean_of(sources: Sequence[Path], region: Region) -> list[MeanValue]:
 
     Raises
     ------
-    ProcessError : no pixel of the region can be used, or the products differ in kind, wavelength or instrument.
+    ProcessError : no pixel of the region can be used, or the products differ in kind or wavelength.
     """
     means = [_Mean.of(source, region) for source in sources]
     first = means[0]
     for source, mean in zip(sources, means, strict=True):
         if mean.alike != first.alike:
             raise ProcessError(
-                f"{source} and {sources[0]} are not of one kind, wavelength and instrument, or one of them is "
-                "simulated. Give those that belong together."
+                f"{source} and {sources[0]} are not of one kind and wavelength, or one of them is simulated, or states "
+                "no uncertainty of its instrument. Give those that belong together."
             )
-    found = _together(means).numbers()
+    together = _together(means)
     each = [mean.numbers() for mean in means] if len(means) > 1 else []
-    return [_value(name, one, [e[name].value for e in each], first.inputs) for name, one in found.items()]
+    return [
+        _value(name, one, [e[name].value for e in each], together.inputs) for name, one in together.numbers().items()
+    ]
 
 
 class _Number(NamedTuple):
@@ -180,7 +183,7 @@ class _Mean:
         """What captures of one mean have in common."""
         i = self.image
         rank = tuple(i.seen) if isinstance(i, MuellerImage) else ()
-        return type(i), rank, round(i.header.wavelength_nm), i.simulated, repr(self.inputs)
+        return type(i), rank, round(i.header.wavelength_nm), i.simulated, bool(self.inputs)
 
     @classmethod
     def of(cls, source: Path, region: Region) -> _Mean:
@@ -260,7 +263,7 @@ def _stokes_mean(image: StokesImage, columns: slice, correlation_s0: Array, sour
 
 
 def _together(means: Sequence[_Mean]) -> _Mean:
-    """The mean of several captures; what one instrument does to all of them does not average.
+    """The mean of several captures; what one instrument does to all of its own does not average.
 
     Each counts alike, whatever its light: they are scaled to one m00 or S0.
     """
@@ -270,8 +273,10 @@ def _together(means: Sequence[_Mean]) -> _Mean:
     level = np.array([float(mean.image.values.reshape(-1)[0]) for mean in means])
     scale = level.mean() / level
     values = np.mean([c * mean.image.values for c, mean in zip(scale, means, strict=True)], axis=0)
-    moves = np.mean([c * mean.moves for c, mean in zip(scale, means, strict=True)], axis=0)
-    image = first.image
+    u_of = {name: u for mean in means for name, u in mean.inputs}
+    names, moved = of_all_inputs([tuple(name for name, _ in mean.inputs) for mean in means], [m.moves for m in means])
+    moves = np.mean([c * one for c, one in zip(scale, moved, strict=True)], axis=0)
+    first, image = replace(first, inputs=tuple((name, u_of[name]) for name in names)), first.image
     if isinstance(image, StokesImage):
         pairs = [(c, m.image) for c, m in zip(scale, means, strict=True) if isinstance(m.image, StokesImage)]
         covariances = [c**2 * other.covariance for c, other in pairs]

@@ -147,11 +147,10 @@ def _require_alike(source: Path, own: ScatteringTable, table: ScatteringTable) -
         raise ProcessError(f"{source} has {own.quantities[0]}, the table has {table.quantities[0]}. Make one of each.")
     if table.scale_u != own.scale_u:
         raise ProcessError(f"{source}: the table has another absolute scale. Use the same --white for all images.")
-    if (table.has_noise, table.inputs) != (own.has_noise, own.inputs):
+    if (table.has_noise, bool(table.inputs)) != (own.has_noise, bool(own.inputs)):
         raise ProcessError(
-            f"{source} was reduced with other uncertainties than the images in the table: of the instrument "
-            f"{', '.join(own.inputs) or 'none'} instead of {', '.join(table.inputs) or 'none'}. Reduce all captures "
-            "with one file: process reduce --instrument FILE"
+            f"{source} or the images in the table have no noise, or no uncertainty of their instrument. Reduce all "
+            "captures with a file that states it: process reduce --instrument FILE"
         )
 
 
@@ -175,7 +174,7 @@ def tabulate(
     Raises
     ------
     ProcessError
-        Products of another kind, wavelength or instrument, without an arm angle, or simulated and measured mixed.
+        Products of another kind or wavelength, without an arm angle, or simulated and measured mixed.
     """
     view = ViewingGeometry.load(geometry_file)
     for done, source in enumerate(sources, 1):
@@ -183,6 +182,8 @@ def tabulate(
             own = _table_for(product, layout, white)
             table = own if table is None else table
             _require_alike(source, own, table)
+            # The images of another instrument go through a table of its own.
+            target = table if own.inputs == table.inputs else own
             kind, omega_deg = product.kind, float(product.header.omega_deg or 0.0)
             # Neighbours share noise across the borders of blocks.
             blocks = product.row_blocks() if kind == "mueller" else [slice(0, product.shape[0])]
@@ -191,9 +192,11 @@ def tabulate(
                 if not image.mask.any():
                     continue
                 if kind == "mueller":
-                    _add_mueller(table, image, product, rows=rows, white=white)
+                    _add_mueller(target, image, product, rows=rows, white=white)
                 else:
-                    table.add(image.points.angles, _xi0_values(table, image, product), product.simulated)
+                    target.add(image.points.angles, _xi0_values(target, image, product), product.simulated)
+            if target is not table:
+                table.merge(target)
         if progress:
             progress(done, len(sources))
     if table is None:

@@ -6,6 +6,7 @@ independent: a value of the train whose standard uncertainty the instrument file
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -29,7 +30,7 @@ class Direction:
 
     Attributes
     ----------
-    label : what is uncertain.
+    label : what is uncertain, with the identity of the instrument.
     u : standard uncertainty of that value, in its unit; NaN where it is no single value of the train.
     turn : (K, K); the unknowns of a pixel move by `turn` times themselves.
     rows : (L, 16), the measurement matrix with this error.
@@ -92,10 +93,12 @@ class Systematic:
             return np.asarray(basis @ np.linalg.pinv(w.reshape(-1, len(basis)) @ basis))
 
         w = matrix(model)[1]
-        flat, out = w.reshape(-1, len(basis)), []
-        for label, u, other, bent in moved:
+        flat, out, seen = w.reshape(-1, len(basis)), [], Counter[str]()
+        for name, u, other, bent in moved:
             rows, own = matrix(other)
             turn = inverse(own) @ flat - basis @ basis.T
+            seen[name] += 1
+            label = f"{name}{f' {seen[name]}' if seen[name] > 1 else ''} ({model.identity})"
             out.append(Direction(label, u, turn, rows.reshape(-1, 16), bent))
         return cls(tuple(out), flat, inverse(w), w.shape[1])
 

@@ -18,6 +18,7 @@ from processing.computing.compiling import njit
 from processing.computing.threads import for_ranges
 from processing.errors import ProcessError
 from processing.geometry.rusinkiewicz import Angles
+from processing.instrument.uncertainty import of_all_inputs
 from processing.reflectance.table_axes import SHAPE, Layout, TableAxes
 from processing.storage.captures.nexus import add_group, add_scales, attach, declare, default_plot, describe_light
 from processing.storage.integrity.h5_door import damage_as, mark_of, open_h5, require_dataset, require_group
@@ -213,17 +214,28 @@ class ScatteringTable:
         return np.where(rows >= 0, self.count[rows], 0) if self.bins.size else np.zeros(rows.shape, dtype=np.int64)
 
     def merge(self, other: ScatteringTable) -> None:
-        """Add all samples of another table of the same quantities, wavelength and layout. Raises TableError."""
+        """Add all samples of another table of the same quantities, wavelength and layout.
+
+        What the inputs of another instrument do is kept apart from what those of this one do.
+
+        Raises
+        ------
+        TableError : the tables do not belong together, or one of them knows no uncertainty of its instrument.
+        """
         mine, theirs = (
-            (t.quantities, t.wavelength_nm, t.axes, t.simulated, t.frames, t.has_noise, t.inputs, t.scale_u)
+            (t.quantities, t.wavelength_nm, t.axes, t.simulated, t.frames, t.has_noise, bool(t.inputs), t.scale_u)
             for t in (self, other)
         )
         if mine != theirs:
             raise TableError(f"tables differ and cannot be merged: {mine} and {theirs}")
+        quantities, start = len(self.quantities), len(self.quantities) * (1 + self.has_noise)
+        parts = [t._sum[start:].reshape(-1, quantities, t.count.size) for t in (self, other)]
+        self.inputs, (own, more) = of_all_inputs([self.inputs, other.inputs], parts)
+        self._sum = np.concatenate([self._sum[:start], own.reshape(-1, self.count.size)])
         rows = other.bins.copy()
         self._claim(rows)
         self.count[rows] += other.count
-        self._sum[:, rows] += other._sum
+        self._sum[:, rows] += np.concatenate([other._sum[:start], more.reshape(-1, other.count.size)])
         self._square[:, rows] += other._square
 
     def _claim(self, bins: NDArray[np.int32]) -> None:

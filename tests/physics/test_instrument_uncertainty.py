@@ -165,7 +165,7 @@ def test_a_table_holds_what_each_direction_does_to_its_means(stated, synthetic_c
     geometry = configs / "geometries/one_inch_sphere.yaml"
     paths = products(synthetic_capture, tmp_path, model, model, np.random.default_rng(4), **header)
     table = tabulate([paths[2]], geometry, "degree")
-    assert table.inputs == tuple(model.stderr)
+    assert table.inputs == tuple(f"{name} ({model.identity})" for name in model.stderr)
     with Product(paths[2]) as product:
         of_pixel = np.median(product.get("xi0_systematic"))
     assert np.median(table.uncertainties["u_systematic"]) == pytest.approx(of_pixel, rel=0.05)
@@ -200,6 +200,32 @@ def test_a_mueller_table_covers_an_instrument_that_is_off_and_its_noise(stated, 
     pulls = [(r.mean - exact.mean) / r.uncertainties["u_noise"] for r in repeats]
     # 24 repeats of some 100 bins in each element.
     assert np.sqrt(np.mean(np.square(pulls), axis=(0, 2))) == pytest.approx(np.ones(16), abs=0.1)
+
+
+def test_what_two_instruments_do_to_a_table_adds_as_squares(stated, synthetic_capture, tmp_path, configs):
+    """Their inputs have the same names. One instrument moves all images of a table alike."""
+    model = InstrumentModel.load(stated).at(662)
+    lent = model.model_copy(update={"name": "another RGB950"})
+    geometry, header = configs / "geometries/one_inch_sphere.yaml", {"omega_deg": 35.0, "rows": 32}
+    paths = [
+        products(synthetic_capture, tmp_path, used, model, None, name, **header)
+        for used, name in ((model, "a"), (model, "b"), (lent, "c"), (lent, "d"))
+    ]
+    for kind in (0, 2):
+
+        def u_systematic(*numbers, kind=kind):
+            return tabulate([paths[k][kind] for k in numbers], geometry, "degree").uncertainties["u_systematic"]
+
+        alone = u_systematic(0)
+        assert u_systematic(0, 1) == pytest.approx(alone, rel=1e-4, abs=1e-9)
+        assert u_systematic(0, 2) == pytest.approx(alone / np.sqrt(2), rel=1e-4, abs=1e-9)
+        assert u_systematic(2, 0, 3) == pytest.approx(alone * np.sqrt(5) / 3, rel=1e-4, abs=1e-9)
+    view = ViewingGeometry.load(geometry)
+    of_a, of_b, of_c = (tabulate([paths[k][2]], geometry, "degree") for k in range(3))
+    same, other = (compare_on_sphere(of_a, table, view, 35.0, shape=(32, 32)) for table in (of_b, of_c))
+    assert same["xi0_systematic_percent"] == pytest.approx(0, abs=1e-6)
+    size = 100 * np.sqrt(2 * np.mean(np.square(of_a.uncertainties["u_systematic"])))
+    assert other["xi0_systematic_percent"] == pytest.approx(size, rel=0.2)
 
 
 def sphere_capture(synthetic_capture, configs, truth, name, **kind):

@@ -9,6 +9,7 @@ from test_instrument_uncertainty import ANGLES, SAMPLE, STEP, drawn, stated  # n
 from typer.testing import CliRunner
 
 from processing.commands.application import app
+from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.maps.means import mean_of
 from processing.polarization.quantities import depolarization_index
@@ -101,7 +102,7 @@ def test_the_instrument_does_not_average_and_scatter_of_captures_counts(stated, 
     name = "m11_over_m00"
     assert whole[name].u_noise == pytest.approx(quarter[name].u_noise / 2, rel=0.05)
     assert whole[name].u_systematic == pytest.approx(quarter[name].u_systematic, rel=0.05)
-    part = next(c for c in whole[name].budget if c.source == "psg_retarder.retardance_deg")
+    part = next(c for c in whole[name].budget if c.source.startswith("psg_retarder.retardance_deg (RGB950"))
     assert part.u == pytest.approx(abs(part.sensitivity) * 0.3)
     # A bench that is mounted anew for each capture: its scatter, with few degrees of freedom.
     anew = [
@@ -112,6 +113,25 @@ def test_the_instrument_does_not_average_and_scatter_of_captures_counts(stated, 
     assert night[name].scatter > 5 * night[name].u_noise
     assert night[name].budget[0].degrees_of_freedom == 3
     assert night[name].budget[0].u == pytest.approx(night[name].scatter / 2)
+
+
+def test_what_two_instruments_do_averages(stated, synthetic_capture, tmp_path):  # noqa: F811
+    """Their inputs have the same names; one instrument moves both captures alike."""
+    model, random = InstrumentModel.load(stated).at(662), np.random.default_rng(9)
+    lent = model.model_copy(update={"name": "another RGB950"})
+    of_one = [mueller_product(synthetic_capture, tmp_path, model, model, random, name) for name in ("a", "b")]
+    of_other = mueller_product(synthetic_capture, tmp_path, lent, model, random, "c")
+    name = "m11_over_m00"
+    alone, shared, apart = (
+        next(v for v in mean_of(sources, WHOLE) if v.name == name)
+        for sources in (of_one[:1], of_one, [of_one[0], of_other])
+    )
+    assert shared.u_systematic == pytest.approx(alone.u_systematic, rel=0.05)
+    assert apart.u_systematic == pytest.approx(alone.u_systematic / np.sqrt(2), rel=0.05)
+    assert len(apart.budget) == 2 * len(shared.budget) - 1
+    known = model.model_copy(update={"stderr": {}})
+    with pytest.raises(ProcessError, match="not of one kind"):
+        mean_of([of_one[0], mueller_product(synthetic_capture, tmp_path, known, model, random, "d")], WHOLE)
 
 
 def test_the_command_writes_csv_json_and_a_budget(stated, synthetic_capture, tmp_path):  # noqa: F811

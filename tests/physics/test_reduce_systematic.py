@@ -141,7 +141,8 @@ def test_a_product_holds_the_directions_that_its_errors_are_made_of(air, configs
     stored = reduced(air, model, tmp_path / "m.h5")
     with Product(tmp_path / "m.h5") as product:
         found = Systematic.of_product(product)
-        assert found.labels == ("detector_nonlinearity", "psg_retardance psg_retarder")
+        names = ("detector_nonlinearity", "psg_retardance psg_retarder")
+        assert found.labels == tuple(f"{name} ({model.at(662).identity})" for name in names)
         values = product.get("mueller").reshape(16, -1)
     moves = list(found.moves(values))
     assert np.abs(moves[0]).max() > 0.001 * values[0].mean()

@@ -144,12 +144,15 @@ def test_a_difference_has_what_the_instruments_do_not_do_alike(client, lab, drr_
     for value in ("127.12", "94.78"):
         files.append(tmp_path / f"{value}.yaml")
         files[-1].write_text(text.replace(f"662: {value}", f"662: {{value: {value}, u: 0.5}}"))
+    # Another instrument whose uncertain inputs have the same names.
+    files.append(tmp_path / "lent.yaml")
+    files[-1].write_text(files[0].read_text().replace("name: RGB950", "name: RGB950 that was lent"))
     one, two = drr_capture("one.h5"), drr_capture("two.h5", seed_of_noise=2)
     three = drr_capture("three.h5", seed_of_noise=3, mueller=np.diag([1.0, 0.6, 0.1, 0.3]))
-    for k, (capture, file) in enumerate(((one, 0), (two, 0), (three, 0), (two, 1))):
+    for k, (capture, file) in enumerate(((one, 0), (two, 0), (three, 0), (two, 1), (two, 2))):
         Reduction(capture, files[file]).make(out=lab / f"{k}.mueller.h5")
     found = {}
-    for k in (1, 2, 3):
+    for k in (1, 2, 3, 4):
         asked = {"a": "0.mueller.h5", "b": f"{k}.mueller.h5", "name": "mueller", "index": 10}
         (_, _, apart, over), found[k] = plane(client.get("/difference", params=asked))
         expected = np.hypot(found[k]["rms_noise"], found[k]["rms_systematic"])
@@ -160,6 +163,7 @@ def test_a_difference_has_what_the_instruments_do_not_do_alike(client, lab, drr_
     assert found[1]["rms_systematic"] < 0.2 * alone
     assert found[2]["rms_systematic"] > 0.3 * alone
     assert found[3]["rms_systematic"] >= 0.99 * alone
+    assert found[4]["rms_systematic"] == pytest.approx(np.sqrt(2) * alone, rel=0.1)
 
 
 @pytest.mark.parametrize("asked", [{"index": 16}, {"index": "x"}, {"name": "nothing"}, {"name": ""}])
