@@ -189,7 +189,7 @@ def test_a_mueller_table_covers_an_instrument_that_is_off_and_its_noise(stated, 
 
     exact, moved, told = table(known, known, None, "e"), table(known, off, None, "m"), table(model, known, None, "t")
     assert set(exact.uncertainties) == {"u_noise"}
-    one = told.directions[told.inputs.index("psg_retarder.retardance_deg")]
+    one = told.directions[told.inputs.index(f"psg_retarder.retardance_deg ({model.identity})")]
     # What the instrument really does is the opposite of what a wrong file does.
     shift = moved.mean / moved.mean[0] - exact.mean / exact.mean[0]
     assert np.abs(shift).max() > 1e-3
