@@ -144,7 +144,9 @@ def import_command(
             Path(item): replace(for_item(request, item), out=place(name_of_item(item))) for item in dict.fromkeys(items)
         }
     if dry_run:
-        for one in requests.values():
+        for item, one in requests.items():
+            if items:
+                typer.echo(f"{item}:")
             show_understood(one)
         return
     sources: dict[Path, Path] = {}

@@ -153,12 +153,14 @@ def test_an_error_has_two_digits_and_its_value_ends_with_it(client, browser, add
 
 
 @pytest.mark.long
-def test_a_browser_keeps_a_region_and_finds_it_on_another_capture(lab, drr_capture, address, browser, draw_region):
+@pytest.mark.parametrize("width", [1400, 380])
+def test_a_browser_keeps_a_region_and_finds_it_on_another_capture(
+    lab, drr_capture, address, browser, draw_region, width
+):
     Reduction(drr_capture("one.h5")).make()
     drr_capture("two.h5", seed_of_noise=2)
-    context = browser.new_context(
-        permissions=["clipboard-read", "clipboard-write"], viewport={"width": 1400, "height": 900}
-    )
+    viewport = {"width": width, "height": 900}
+    context = browser.new_context(permissions=["clipboard-read", "clipboard-write"], viewport=viewport)
     page = context.new_page()
     page.set_default_timeout(60_000)
     expect.set_options(timeout=60_000)
