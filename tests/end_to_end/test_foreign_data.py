@@ -17,6 +17,7 @@ from processing.instrument.elements import Diattenuator, Polarizer, Retarder
 from processing.instrument.measured import MeasuredMatrix
 from processing.instrument.model import Channel, InstrumentModel
 from processing.storage.captures.capture import Capture
+from processing.storage.formats.importing import name_of_item
 from processing.storage.products.images import MuellerImage
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -183,6 +184,19 @@ def test_several_measurements_in_one_command(day, process):
     code, said, errors = process("import", *options, *runs)
     assert (code, said.splitlines()[-1]) == (2, "3 inputs: 0 made, 2 unchanged, 1 failed")
     assert f"{made[0]} exists" in errors
+
+
+@pytest.mark.parametrize(
+    ("item", "name"),
+    [("day/run.1/", "day/run.1.h5"), ("day/run.1.h5::/scan/a", "day/run.1_scan_a.h5"), (".", "day.h5"), ("/", ".h5")],
+)
+def test_the_capture_of_a_measurement_is_next_to_it(item, name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("day/run.1").mkdir(parents=True)
+    if item == ".":
+        monkeypatch.chdir("day")
+    start = Path("/") if item == "/" else tmp_path
+    assert Path(name_of_item(item)).absolute() == start / name
 
 
 def test_the_stack_of_a_recipe_is_that_of_no_other_measurement(day, process):

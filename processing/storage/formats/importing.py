@@ -165,9 +165,9 @@ def for_item(request: ImportRequest, item: str) -> ImportRequest:
 def name_of_item(item: str) -> Path:
     """The usual capture of one of several measurements: NAME.h5 next to it, NAME_DATASET.h5 for `NAME.h5::/dataset`."""
     file, _, inside = item.partition("::")
-    path = Path(file)
+    path = Path(file) if Path(file).name.strip(".") else Path(file).resolve()
     stem = path.name if path.is_dir() else path.stem
-    return path.with_name("_".join([stem, *re.findall(r"\w+", inside)]) + ".h5")
+    return path.parent / ("_".join([stem, *re.findall(r"\w+", inside)]) + ".h5")
 
 
 def is_imported(request: ImportRequest) -> bool:
