@@ -122,6 +122,8 @@ def _axis(axis: MotionAxis) -> str:
     warnings = "".join(f", warning: {text}" for text in axis.warnings())
     stop = "" if axis.can_stop_a_move else ", cannot be stopped once it moves"
     name = f"{who.kind} {who.model}, serial {who.serial_number}, firmware {who.firmware}"
+    if axis.config.unit == "V":
+        return f"{name}, {who.port}: {position}{ends}{warnings}"
     # As `process design --speed` wants it.
     speed = f"{axis.speed_deg_s:.4g}:{axis.acceleration_deg_s2:.4g} deg/s:deg/s2"
     return f"{name}, {who.port}: {homed}{moving}, {position}{ends}, speed {speed}{stop}{warnings}"
