@@ -1,7 +1,9 @@
 """Whether an effect is as large in every part of the image, where something else is not told right or moves it."""
 
 import numpy as np
+import pytest
 from bench_capture import bench_capture
+from scipy.ndimage import rotate
 
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.captured.screening import without_steep_pixels
@@ -45,3 +47,19 @@ def test_where_the_image_moves_a_source_is_as_even(configs, tmp_path):
     drift = next(c for c in space.candidates if c.kind == "source_drift")
     excess, terms = Evenness(problem, space, fit.values).varies(drift)
     assert abs(excess) < 4 * np.sqrt(2 * terms)
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_a_drift_is_even_over_the_image_and_an_image_that_turns_is_not(configs, tmp_path, turns):
+    bench = TrueBench(rows=64, columns=64)
+    bench.shift.append(lambda k, a: (0.1 * k / (STATES - 1), 0.0))
+    if turns:
+        bench.light.append(lambda k, e: rotate(e, 0.3 * k / (STATES - 1), reshape=False, order=3, mode="nearest"))
+    file = configs / "instruments/rgb950.yaml"
+    model = InstrumentModel.load(file).nominal_at(662)
+    with Capture(bench_capture(tmp_path, file, bench, seed=8, scene=RoundSample)) as taken:
+        problem = InstrumentProblem(model, [without_steep_pixels(read_capture(taken, model))])
+    space = Space(tuple(c for c in problem.pool() if c.kind == "image_drift"))
+    fit = minimize(problem, space, np.zeros(space.size))
+    excess, terms = Evenness(problem, space, fit.values).varies(space.candidates[0])
+    assert (excess > 4 * np.sqrt(2 * terms)) == turns, excess

@@ -18,14 +18,13 @@ from processing.diagnosis.search.rules import (
     CERTAIN,
     EDGES,
     LIMIT,
-    NOISE_SURE,
+    OUTSTANDING,
     SURE,
     TESTABLE,
     TIMES,
     UNEVEN_SHARE,
 )
 from processing.instrument.effects.base import (
-    CountsEffect,
     FieldEffect,
     GeneralEffect,
     PointwiseEffect,
@@ -35,8 +34,8 @@ from processing.instrument.effects.base import (
 
 #: The image does not move where that would be seen best.
 STANDS = "the edges, which were left out of the fit, do not move as it says"
-#: Optics and mechanics are the same for the whole image.
-NOT_ALIKE = "it differs from part to part of the image, which nothing in the train does"
+#: Optics, mechanics and detector are the same for the whole image.
+NOT_ALIKE = "it differs from part to part of the image, which this effect does not"
 #: [chi-square, fixed] That has odds of 99 to 1.
 STANDS_OUT = 2 * float(np.log(SURE / (1 - SURE)))
 #: Reasons that say that something else is there, of which what the cause explains is left over.
@@ -111,7 +110,7 @@ def _of_itself(
     if isinstance(effect, SourceEffect):
         return OF_THE_SAMPLE if any(_uneven(even, solved, c, cause) for c in cause.candidates) else None
     # Channels that look at places apart leave something where the image is curved: that is not alike either.
-    alike = isinstance(effect, CountsEffect) or any(c.place_px is not None for c in problem.captures)
+    alike = any(c.place_px is not None for c in problem.captures)
     if not alike and any(_uneven(even, solved, c, cause) for c in cause.candidates):
         return NOT_ALIKE
     return None
@@ -164,8 +163,8 @@ def _at_bound(cause: Cause) -> bool:
 
 
 def _uneven(even: Evenness, solved: Solution, candidate: Candidate, cause: Cause) -> bool:
-    """A source, or a train, that changes does so alike in the whole image; what differs from part to part is none."""
+    """A source, a train or a detector that changes does so alike in the whole image."""
     if candidate not in solved.space.candidates or any(isinstance(c.effect, FieldEffect) for c in solved.effects):
         return False
     excess, terms = even.varies(candidate)
-    return bool(excess > max(NOISE_SURE * np.sqrt(2 * terms), UNEVEN_SHARE * 2 * cause.log_odds))
+    return bool(excess > max(OUTSTANDING * np.sqrt(2 * terms), UNEVEN_SHARE * 2 * cause.log_odds))

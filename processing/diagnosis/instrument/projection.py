@@ -221,10 +221,16 @@ class Projected:
             curvature[np.ix_(counted, counted)] += _flat(of_counts) @ _flat(of_counts).T
         return gradient, pull, curvature
 
-    def of_each(self, da: Array) -> tuple[Array, Array]:
-        """Half gradient (T,) of the excess of each part by one value, and its curvature (T,), of da (L, K')."""
+    def of_each(self, da: Array, dc: Array) -> tuple[Array, Array]:
+        """Half gradient (T,) of the excess of each part by one value, and its curvature (T,).
+
+        Of da (L, K') and dc (F, L), as in `slopes`.
+        """
+        by_counts = self.moved_by_counts(dc[None])
         da = self.outside @ da
-        return np.sum(da * self.by_rows[0], axis=(1, 2)), np.sum((da @ self.unknowns.transpose(0, 2, 1)) ** 2, (1, 2))
+        gradient = np.sum(da * self.by_rows[0], axis=(1, 2)) + np.sum(by_counts * self.residual, axis=(1, 2))
+        gradient -= np.sum(dc * self._noise.of_features, axis=(1, 2))
+        return gradient, np.sum((by_counts - da @ self.unknowns.transpose(0, 2, 1)) ** 2, axis=(1, 2))
 
 
 def add_parts(

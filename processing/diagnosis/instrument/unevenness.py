@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
@@ -24,7 +25,7 @@ class Evenness:
     def __init__(self, problem: InstrumentProblem, space: Space, values: Array) -> None:
         """Problem and values (K,) of the space that was fitted."""
         self._fitted, self._space, self._values = problem, space, values
-        self._parts: dict[int, Projected] = {}
+        self._parts: dict[tuple[int, tuple[int, ...]], tuple[Projected, NDArray[np.int64]]] = {}
 
     @cached_property
     def _near(self) -> tuple[InstrumentProblem, Array]:
@@ -39,16 +40,19 @@ class Evenness:
         """
         part = self._space.slices[self._space.candidates.index(candidate)]
         problem, local = self._near
+        # What was undone in the counts has no value left there.
         moved = local.copy()
-        moved[part] *= 1 + STEP
+        moved[part] += STEP * self._values[part]
         out, count = 0.0, 0
         for k, moments in enumerate(problem.moments):
             tiles = moments.tiles
             if tiles is None or not candidate.acts(k, problem.wavelengths_nm[k]):
                 continue
-            if k not in self._parts:
-                self._parts[k] = self._projected(k, tiles)
-            slope, power = self._parts[k].of_each((self._rows(k, moved) - self._rows(k, local)) / STEP)
+            rows, c = self._at(k, local)
+            there, more = self._at(k, moved)
+            dc = (more - c) / STEP
+            projected, used = self._projected(k, tiles, rows, c, dc=dc)
+            slope, power = projected.of_each((there - rows) / STEP, dc[used])
             smooth = np.vstack([np.ones(tiles.x.size), field_terms(tiles.x, tiles.y)])
             pull = smooth @ slope
             out += float(pull @ np.linalg.pinv((smooth * power) @ smooth.T, hermitian=True) @ pull)
@@ -56,26 +60,22 @@ class Evenness:
             count += len(smooth) - 1
         return out - count, count
 
-    def _rows(self, k: int, values: Array) -> Array:
-        """(L, K) of the rows that count, in units of their noise."""
+    def _at(self, k: int, values: Array) -> tuple[Array, Array]:
+        """Rows (L, K) that count, in units of their noise, and coefficients (F, L) of their counts."""
         problem, _ = self._near
-        rows = problem.columns(k, problem.changes(k, self._space, values))
-        return np.asarray(rows[problem.moments[k].counts])
+        changes, use = problem.changes(k, self._space, values), problem.moments[k].counts
+        return np.asarray(problem.columns(k, changes)[use]), problem.coefficients(k, changes)[:, use]
 
-    def _projected(self, k: int, tiles: Tiles) -> Projected:
-        """The tiles with the counts corrected: what a shift leaves of an image would seem to vary over it."""
-        problem, local = self._near
-        moments = problem.moments[k]
-        use = np.flatnonzero(moments.counts)
-        c = problem.coefficients(k, problem.changes(k, self._space, local))
-        asked = np.flatnonzero(np.any(c, axis=1)).tolist()
-        known, z, noise = features_of_tiles(problem.captures[k], moments, tiles, asked)
-        used = np.array(known)
-        rows = self._rows(k, local)
-        return Projected(
-            z,
-            noise,
-            np.broadcast_to(rows, (tiles.x.size, *rows.shape)),
-            c[None, used][:, :, use],
-            around=used >= len(FEATURES) - DERIVATIVES,
-        )
+    def _projected(
+        self, k: int, tiles: Tiles, rows: Array, c: Array, *, dc: Array
+    ) -> tuple[Projected, NDArray[np.int64]]:
+        """The tiles with the counts corrected, and the features they have: what a shift leaves seems to vary."""
+        problem, _ = self._near
+        asked = tuple(np.flatnonzero(np.any(c, axis=1) | np.any(dc, axis=1)).tolist())
+        if (k, asked) not in self._parts:
+            known, z, noise = features_of_tiles(problem.captures[k], problem.moments[k], tiles, asked)
+            used = np.array(known)
+            around = used >= len(FEATURES) - DERIVATIVES
+            wide = np.broadcast_to(rows, (tiles.x.size, *rows.shape))
+            self._parts[k, asked] = Projected(z, noise, wide, c[None, used], around=around), used
+        return self._parts[k, asked]
