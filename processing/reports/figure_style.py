@@ -84,8 +84,8 @@ def _map(figure: Figure, axis: Any, values: NDArray[Any], label: str, **keywords
     shown = axis.imshow(values, interpolation="nearest", **keywords)
     axis.set_title(label, fontsize=10)
     axis.set_facecolor("0.85")
-    axis.set_xticks([])
-    axis.set_yticks([])
+    axis.xaxis.set_visible(False)
+    axis.yaxis.set_visible(False)
     figure.colorbar(shown, ax=axis, shrink=0.85, extend=clipped(values, *shown.get_clim()))
 
 

@@ -107,8 +107,8 @@ def mueller_figure(elements: NDArray[Any], lit: NDArray[np.bool_], title: str, s
     for i in range(4):
         for j in range(4):
             panel = panels[i, j]
-            panel.set_xticks([])
-            panel.set_yticks([])
+            panel.xaxis.set_visible(False)
+            panel.yaxis.set_visible(False)
             panel.set_facecolor("0.85")
             panel.set_title(f"$m_{{{i}{j}}}$", fontsize=9, pad=2)
             if i == j == 0:

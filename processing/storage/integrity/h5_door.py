@@ -53,18 +53,25 @@ def _require_own(h5: h5py.File) -> None:
     """Raise ValueError where a part of a file lies in another one: that may be a pipe, or what nobody meant to give."""
     count = 0
 
-    def look(name: str, link: h5py.HardLink | h5py.SoftLink | h5py.ExternalLink) -> str | None:
+    # The low-level interface makes no object for a part: a quarter of the time of `visititems_links`.
+    def look(name: bytes, link: Any) -> str | None:
         nonlocal count
         count += 1
-        if isinstance(link, h5py.ExternalLink):
-            return f"{one_line(name)} is a link into another file, {one_line(link.filename)}"
-        node = h5.get(name) if isinstance(link, h5py.HardLink) else None
-        if isinstance(node, h5py.Dataset) and (node.is_virtual or node.external):
-            return f"{one_line(name)} lies in another file"
+        if link.type == h5py.h5l.TYPE_HARD:
+            try:
+                node = h5py.h5o.open(h5.id, name)
+            except KeyError:
+                return None
+            if isinstance(node, h5py.h5d.DatasetID):
+                made = node.get_create_plist()
+                if made.get_layout() == h5py.h5d.VIRTUAL or made.get_external_count():
+                    return f"{one_line(name.decode(errors='replace'))} lies in another file"
+        elif link.type != h5py.h5l.TYPE_SOFT:
+            return f"{one_line(name.decode(errors='replace'))} is a link into another file"
         return f"more than {MOST_LINKS:,} parts" if count > MOST_LINKS else None
 
     try:
-        found = h5.visititems_links(look)
+        found = h5.id.links.visit(look, info=True)
     except SystemError as why:
         # How h5py passes on what HDF5 says of damage below its callback.
         raise ValueError(str(why.__cause__ or why)) from why
