@@ -90,39 +90,47 @@ def run(options: list[str], out: Path, before: Callable[[DiscCalls], None] = lam
             os._exit(code)
     os.close(writer)
     status = os.waitpid(child, 0)[1]
-    _wait_for_orphans()
+    wait_for_orphans()
     with os.fdopen(reader) as pipe:
         made = pipe.read()
     return status, int(made or 0)
 
 
-def _wait_for_orphans() -> None:
+def wait_for_orphans() -> None:
     """Wait for the disc process of what has ended, which becomes a child of this program; it dies a moment later."""
     with contextlib.suppress(ChildProcessError):
         while True:
             os.waitpid(-1, 0)
 
 
-def content(folder: Path) -> dict[str, bytes]:
-    """Digests of everything in the captures of a campaign but times."""
+def content(capture: Path) -> dict[str, bytes]:
+    """Digests of everything in a capture but times."""
     found: dict[str, bytes] = {}
-    for path in sorted((folder / "night").glob("*.h5")):
-        with h5py.File(path) as h5:
 
-            def visit(name: str, node: h5py.Group | h5py.Dataset, path: Path = path) -> None:
-                if isinstance(node, h5py.Dataset) and not name.endswith(TIMES):
-                    value = np.asarray(node[()])
-                    raw = str(value).encode() if value.dtype == object else value.tobytes()
-                    found[f"{path.name}/{name}"] = hashlib.blake2b(raw).digest()
+    def visit(name: str, node: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(node, h5py.Dataset) and not name.endswith(TIMES):
+            value = np.asarray(node[()])
+            raw = str(value).encode() if value.dtype == object else value.tobytes()
+            found[name] = hashlib.blake2b(raw).digest()
 
-            h5.visititems(visit)
+    with h5py.File(capture) as h5:
+        h5.visititems(visit)
     return found
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Digests of all captures of a campaign."""
+    return {
+        f"{path.name}/{name}": digest
+        for path in sorted((folder / "night").glob("*.h5"))
+        for name, digest in content(path).items()
+    }
 
 
 def check(out: Path, whole: dict[str, bytes]) -> str:
     """What is wrong with a campaign that came to its end, or nothing."""
     wrong = [f"{f.what}: {f.found}" for f in verify(out / "night") if f.well is not True]
-    there = content(out)
+    there = contents(out)
     differing = sorted(name for name in {*whole, *there} if whole.get(name) != there.get(name))
     if differing:
         wrong.append(f"differs from an undisturbed run in {differing[:5]}")
@@ -134,7 +142,7 @@ def kill(options: list[str], every: int, first: int, fails: bool) -> int:
     captures = WORK / "captures"
     status, total = run(options, captures / "whole", lambda calls: calls.arm(0))
     assert status == 0, status
-    whole = content(captures / "whole")
+    whole = contents(captures / "whole")
     lost = points = 0
     begin_s = time.monotonic()
     for number in range(first, total + 1, every):
@@ -186,7 +194,7 @@ def night(options: list[str], captures: int, calls: int, seed: int = 1) -> int:
         if kills % 50 == 0:
             passed_s = time.monotonic() - begin_s
             print(f"{kills} kills, {errors} failing calls, {known.states()} states, {passed_s:.0f} s", flush=True)
-    wrong += filter(None, [check(out, content(WORK / "captures" / "whole"))])
+    wrong += filter(None, [check(out, contents(WORK / "captures" / "whole"))])
     complete = len(list((out / "night").glob("*.h5")))
     code = os.waitstatus_to_exitcode(status)
     print(
@@ -322,7 +330,7 @@ def image(options: list[str], cuts: int, seed: int = 1) -> int:
         if os.WIFSTOPPED(status):
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
-            _wait_for_orphans()
+            wait_for_orphans()
         subprocess.run(["umount", mount], check=True)
         copy = WORK / "copy"
         copy.mkdir(exist_ok=True)

@@ -1,6 +1,6 @@
 """Promises 14 and 15: killed before any call that changes the disc, or without power there, next to nothing is lost.
 
-A sample of what `python tests/faults/kill_points.py` runs in full.
+A sample of what `python tests/faults/kill_points.py` and `capture_life.py` run in full.
 """
 
 import os
@@ -14,14 +14,14 @@ import pytest
 from simulators.disc.power_cut import UnreliableDisc, read_record
 from simulators.disc.watched import compiler
 
-PROGRAM = Path(__file__).with_name("kill_points.py")
+HERE = Path(__file__).parent
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler: calls cannot be watched")
 
 
-def _run(*arguments, work):
+def _run(program, *arguments, work):
     done = subprocess.run(
-        [sys.executable, str(PROGRAM), *map(str, arguments)],
+        [sys.executable, str(HERE / program), *map(str, arguments)],
         capture_output=True,
         text=True,
         check=False,
@@ -33,11 +33,15 @@ def _run(*arguments, work):
 
 def test_killed_at_a_sample_of_calls_the_same_command_goes_on(tmp_path):
     # One while the file is laid out, one among its states.
-    assert "0 with something lost" in _run("kill", 90, 60, work=tmp_path)
+    assert "0 with something lost" in _run("kill_points.py", "kill", 90, 60, work=tmp_path)
 
 
 def test_a_power_cut_at_any_call_takes_one_reported_state_at_most(tmp_path):
-    assert " 0 beyond the bound" in _run("power", 0, work=tmp_path)
+    assert " 0 beyond the bound" in _run("kill_points.py", "power", 0, work=tmp_path)
+
+
+def test_in_any_order_of_ends_resumes_and_other_devices_nothing_reported_is_lost(tmp_path, runs):
+    _run("capture_life.py", 10 * runs, work=tmp_path)
 
 
 def test_the_disc_keeps_what_was_synced_and_only_that(tmp_path):

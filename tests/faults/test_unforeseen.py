@@ -16,18 +16,17 @@ from processing.storage.captures.capture import Capture
 SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
 
 
-@pytest.mark.parametrize("kind", [ValueError, MemoryError])
-def test_an_error_that_nobody_foresaw_is_recorded_and_the_capture_goes_on(run_with, intact, kind):
+def test_an_error_that_nobody_foresaw_is_recorded_and_the_capture_goes_on(run_with, intact):
     rigs = []
 
     def act(rig, state, retake):
         rigs.append(rig)
         if state == 5:
-            raise kind("injected")
+            raise ValueError("injected")
 
     error, path = run_with(act, plan=SHORT)
     assert isinstance(error, Unforeseen)
-    assert kind.__name__ in str(error)
+    assert "ValueError" in str(error)
     assert path.name == "run.h5.partial"
     assert not rigs[0].simulation.light()
     with Capture(path) as capture:
