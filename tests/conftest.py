@@ -12,6 +12,9 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+# Each capture draws its figure in a process that is forked for it. What is loaded here need not be loaded there.
+import matplotlib.backends.backend_agg  # noqa: F401
+import matplotlib.figure  # noqa: F401
 import numpy as np
 import pytest
 
