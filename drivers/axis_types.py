@@ -14,7 +14,7 @@ NO_LIMIT_DEG = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """A position read from an axis: user degrees, and the controller's own number beside it.
+    """A position read from an axis: user degrees (volts where `unit` says so), and the controller's own number.
 
     A position at rest is confirmed by a second reading; one in motion (`confirmed` False) cannot be, and is for
     show and for the detection of a stall, not for a record.
@@ -23,6 +23,11 @@ class Position:
     deg: float
     counts: int | float
     confirmed: bool = True
+    unit: str = "deg"
+
+    def __str__(self) -> str:
+        """For a page: what turns on and on is within one turn."""
+        return f"{self.deg % 360:.3f}°" if self.unit == "deg" else f"{self.deg:.3f} {self.unit}"
 
 
 @dataclass(frozen=True, slots=True)

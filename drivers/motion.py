@@ -254,7 +254,7 @@ class MotionAxis(ABC):
             Readings at rest contradict each other.
         """
         counts, confirmed = self._read_confirmed()
-        return Position(self._to_user_deg(counts / self.counts_per_deg), counts, confirmed)
+        return Position(self._to_user_deg(counts / self.counts_per_deg), counts, confirmed, self.config.unit)
 
     def _read_confirmed(self) -> tuple[int | float, bool]:
         """Return the counts, and False if they are those of an axis in motion."""

@@ -48,8 +48,7 @@ def seen(folder: Path, library: Library) -> dict[str, Any]:
         return found
     found |= {key: run.get(key) for key in ("title", "activity", "done", "pending", "left_s", "messages", "capture")}
     found |= {"number": run.get("campaign_done", 0) + 1, "total": run.get("campaign_total", 1)}
-    # What turns on and on is told within one turn.
-    found["axes_deg"] = {name: degrees % 360 for name, degrees in (run.get("axes_deg") or {}).items()}
+    found["axes"] = run.get("axes") or {}
     found |= _taken(folder / str(run.get("capture")), library)
     return found
 

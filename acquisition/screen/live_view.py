@@ -114,7 +114,7 @@ class LiveView(Observer):
             left_s=round(elapsed_s / done * (pending - done), 1),
             frame=report.state,
             role=report.role,
-            axes={name: round(position.deg, 4) for name, position in report.positions.items()},
+            axes={name: str(position) for name, position in report.positions.items()},
             exposure_s=report.exposure_s,
             saturated=report.saturated_fraction,
             near_black=report.near_black_fraction,

@@ -79,7 +79,7 @@ class RunFile(Observer):
             done=done,
             activity=f"state {report.state} ({report.role})",
             left_s=round((time.monotonic() - self._start_s) / done * (pending - done), 1),
-            axes_deg={name: position.deg for name, position in report.positions.items()},
+            axes={name: str(position) for name, position in report.positions.items()},
             exposure_s=report.exposure_s,
             saturated=report.saturated_fraction,
         )

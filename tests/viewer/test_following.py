@@ -33,7 +33,7 @@ def until(condition):
 
 
 def report(number):
-    positions = {"psg": Position(9.0 * number, number)}
+    positions = {"psg": Position(9.0 * number, number), "lcr": Position(1.53, 1.53, unit="V")}
     return StateReport(number, "sample", positions, 0.01, 0.0, 0.0, 1e5, np.zeros((4, 4), np.uint16))
 
 
@@ -51,7 +51,7 @@ def test_a_run_says_where_it_is_while_it_runs_and_nothing_afterwards(lab):
         shown = seen(lab, Library(lab))
         assert (shown["number"], shown["total"]) == (3, 5)
         # The axis stands at its second turn.
-        assert shown["axes_deg"] == {"psg": 0.0}
+        assert shown["axes"] == {"psg": "0.000°", "lcr": "1.530 V"}
     assert running_in(lab) is None
     assert list(lab.iterdir()) == []
 

@@ -106,7 +106,7 @@ function show(now) {
   byId("activity").textContent = now.activity;
   grid(now);
   renew(now).catch(() => { logged = ""; });
-  facts(byId("axes"), Object.entries(now.axes_deg).map(([name, value]) => [name, `${value.toFixed(3)}°`]));
+  facts(byId("axes"), Object.entries(now.axes));
   if (now.lamp) drawLamp(now.lamp);
   byId("messages").replaceChildren(...(now.messages.length ? now.messages : ["none"]).map(text => {
     const line = document.createElement("div");
