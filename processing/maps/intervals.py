@@ -21,6 +21,7 @@ from processing.polarization.magnitude import NORMAL_95, directions, interval, s
 from processing.polarization.propagation import Derived
 from processing.polarization.quantities import entropy
 from processing.polarization.scalar_files import scalar_quantities
+from processing.polarization.sorted_eigenvalues import of_gaps
 from processing.reduction.systematic import Systematic
 from processing.storage.products.images import MuellerImage
 
@@ -63,6 +64,7 @@ OWN_95 = (
     *(f"dominant_{name}_{part}" for name in ("diattenuation", "polarizance") for part in ("linear", "circular")),
     "polarizance_ellipticity_deg",
     "coherency_eigenvalues",
+    "eigenvalue_deviation",
     "entropy",
     "depolarization_index",
     "depolarization_power",
@@ -306,30 +308,52 @@ def set_differential(planes: Planes, is_determined: NDArray[np.bool_]) -> None:
 def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0) -> None:
     """Noise taken off eigenvalues, which it pushes apart, and off what follows from them.
 
-    xi0 is that of `process xi0`. The others keep their mean; their deviations from it lose what noise adds.
+    xi0 is that of `process xi0`. The others keep their mean; their gaps say how far noise has pushed them.
     """
     xi, errors = planes["coherency_eigenvalues"].astype(float), planes["coherency_eigenvalues_errors"].astype(float)
     deviation = planes["eigenvalue_deviation"].astype(float)
     observed = np.sum(deviation**2, axis=0)
     real = np.sqrt(np.maximum(1 - noise.others / observed, 0))
-    among = np.sqrt(noise.others / 8)
-    gaps = np.stack([xi[1] - xi[2], np.minimum(xi[1] - xi[2], xi[2] - xi[3]), xi[2] - xi[3]])
-    mixed = np.maximum(among - gaps / APART, 0)
-    mean = (1 - found.xi0) / 3
-    spread = np.hypot(errors[1:], mixed)
-    xi = np.stack([found.xi0, *(mean + real * deviation)])
-    errors = np.stack([found.stderr, *spread])
-    bounds = (
-        [found.interval_95[0], *(xi[1:] - NORMAL_95 * spread)],
-        [found.interval_95[1], *(xi[1:] + NORMAL_95 * spread)],
+    unit = np.sqrt(noise.others / 8)
+    gaps = -np.diff(xi[1:], axis=0)
+    three = of_gaps(*(gaps / unit))
+    # Where an eigenvalue is apart from the others it has the noise of its own process, else of all three.
+    apart = np.clip(np.stack([gaps[0], gaps.min(axis=0), gaps[1]]) / (APART * unit), 0, 1)
+    mixed, mean = unit * (1 - apart), (1 - found.xi0) / 3
+    shrunk = np.stack([found.xi0, *(mean + real * deviation)])
+    spread = np.stack([found.stderr, *np.hypot(errors[1:], mixed)])
+    own = errors[1:] / (np.sqrt(0.75) * unit)
+    of_all = np.maximum(np.sqrt(np.mean(own**2, axis=0)), 1)
+    with_mean, alone = three.with_mean(found.stderr / (3 * unit)), three.with_mean(np.zeros_like(unit))
+    near, wide = unit * (of_all + apart * (own - of_all)), unit * np.maximum(own, of_all)
+    deviation = deviation + unit * three.middle
+    xi = mean + deviation
+    low, high = xi - wide * with_mean.below, xi + wide * with_mean.above
+    _put(
+        planes,
+        "coherency_eigenvalues",
+        np.stack([found.xi0, *xi]),
+        np.stack([found.stderr, *(near * with_mean.half)]),
+        np.stack([found.interval_95[0], *low]),
+        np.stack([found.interval_95[1], *high]),
     )
-    _put(planes, "coherency_eigenvalues", xi, errors, np.stack(bounds[0]), np.stack(bounds[1]))
-    planes["eigenvalue_deviation"] = (real * deviation).astype(np.float32)
-    planes["eigenvalue_deviation_errors"] = np.hypot(planes["eigenvalue_deviation_errors"], mixed).astype(np.float32)
+    _put(
+        planes,
+        "eigenvalue_deviation",
+        deviation,
+        near * alone.half,
+        deviation - wide * alone.below,
+        deviation + wide * alone.above,
+    )
     missed = planes["td_missed"].astype(float)
     planes["td_missed_noise"] = (missed * np.sqrt(noise.others / observed)).astype(np.float32)
     planes["td_missed"] = (missed * real).astype(np.float32)
     planes["td_missed_errors"] = np.hypot(planes["td_missed_errors"], mixed.max(axis=0)).astype(np.float32)
+    _set_entropy(planes, shrunk, spread, found)
+
+
+def _set_entropy(planes: Planes, xi: Array, errors: Array, found: CorrectedXi0) -> None:
+    """Entropy of eigenvalues (4, ...) whose deviations have lost what noise adds."""
     physical = np.clip(xi, 0, None)
     physical /= physical.sum(axis=0)
     # At an eigenvalue of zero the logarithm has no slope; within three errors of it that of one error is taken.

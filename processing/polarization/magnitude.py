@@ -114,7 +114,7 @@ def _near(table: NDArray[np.float64], at: Array) -> list[Array]:
     if len(places) == 1:
         places = np.concatenate([np.zeros((2, places.shape[1])), places])
     found = np.empty((5, places.shape[1]))
-    _interpolate(np.ascontiguousarray(np.moveaxis(cube, 0, -1)), places, found)
+    interpolate(np.ascontiguousarray(np.moveaxis(cube, 0, -1)), places, found)
     low, high, low_95, high_95, end = found.reshape(5, *at.shape[1:])
     # Of an upper limit alone the value goes to zero with what is observed.
     value = np.where(low > 0, (low + high) / 2, np.minimum(high**2 / end, high) / 2)
@@ -122,7 +122,7 @@ def _near(table: NDArray[np.float64], at: Array) -> list[Array]:
 
 
 @njit(cache=True, nogil=True)
-def _interpolate(table, places, out):  # type: ignore[no-untyped-def]
+def interpolate(table, places, out):  # type: ignore[no-untyped-def]
     """Linear interpolation of all planes of a table (n, m, k, planes) at `places` (3, pixels); beyond it the last."""
     last = (table.shape[0] - 1, table.shape[1] - 1, table.shape[2] - 1)
     for p in range(places.shape[1]):

@@ -1,0 +1,85 @@
+"""Intervals of three eigenvalues of a noisy Hermitian matrix, which noise pushes apart: each covers at every gap.
+
+The mean of the three is normal, their gaps are not. A bound is the observed eigenvalue plus a shift that depends on
+both gaps; the shifts are those with which a bound holds as often as it claims, whatever the true gaps are. The table
+is made by `benchmarks/eigenvalue_table.py`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.arrays import Array
+from processing.polarization.magnitude import NORMAL_95, interpolate
+
+#: Nodes of the table along both gaps, in units of the noise of an element.
+GAPS = np.array([0, 1, 2, 3, 4, 5, 6.5, 8.5, 11, 14.0])
+#: Variance of the mean of the three in that unit squared: of an isotropic 4 x 4 matrix of fixed trace.
+OF_MEAN = 1 / 12
+TABLE = Path(__file__).with_name("eigenvalue_table.npz")
+#: A half width squared is at least this part of what it is with the noise of the mean.
+_LEAST = 0.05
+
+
+class Sorted(NamedTuple):
+    """Of three eigenvalues (3, ...), descending, in units of the noise: shifts from the observed deviations.
+
+    Attributes
+    ----------
+    middle, half : of the 68 % interval; the three middles add up to zero.
+    below, above : from there to the ends of the 95 % interval.
+    """
+
+    middle: Array
+    half: Array
+    below: Array
+    above: Array
+
+    def with_mean(self, u: Array) -> Sorted:
+        """Intervals where the mean of the three has this standard uncertainty (...) instead."""
+
+        def wide(size: Array, deviate: float) -> Array:
+            own = np.maximum(size**2 - deviate**2 * OF_MEAN, _LEAST * size**2)
+            return np.asarray(np.sqrt(own + np.square(deviate * u)))
+
+        ends = (wide(size, NORMAL_95) for size in (self.below, self.above))
+        return Sorted(self.middle, wide(self.half, 1.0), *ends)
+
+
+def of_gaps(first: Array, second: Array) -> Sorted:
+    """Intervals for the observed gaps (...) of the largest and of the smallest eigenvalue to the middle one.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> found = of_gaps(np.array([1.0, 20.0]), np.array([1.0, 20.0]))
+    >>> found.half[0].round(1).tolist(), bool(found.middle[0, 0] < -1)
+    ([1.1, 0.8], True)
+    """
+    one, other = (_shifts(*gaps) for gaps in ((first, second), (second, first)))
+    # The smallest is the largest of the matrix with the opposite sign, and the middle one stays the middle one.
+    low, high = np.stack([one[0], one[4], -other[1]]), np.stack([one[1], -other[4], -other[0]])
+    low_95, high_95 = np.stack([one[2], one[5], -other[3]]), np.stack([one[3], -other[5], -other[2]])
+    # What the three add up to is known.
+    middle = (low + high) / 2
+    middle -= middle.mean(axis=0)
+    return Sorted(middle, (high - low) / 2, middle - low_95, high_95 - middle)
+
+
+def _shifts(first: Array, second: Array) -> NDArray[np.float64]:
+    """Of the largest lower and upper bound at 68, then at 95 %; of the middle one the lower bounds: (6, ...)."""
+    places = [np.interp(np.nan_to_num(gap), GAPS, np.arange(len(GAPS))).reshape(-1) for gap in (first, second)]
+    out = np.empty((6, first.size))
+    interpolate(_table(), np.stack([np.zeros(first.size), *places]), out)
+    return out.reshape(6, *first.shape)
+
+
+@cache
+def _table() -> NDArray[np.float64]:
+    with np.load(TABLE) as stored:
+        return np.ascontiguousarray(np.moveaxis(stored["shifts"], 0, -1)[None], dtype=float)
