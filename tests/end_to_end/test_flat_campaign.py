@@ -17,6 +17,8 @@ from processing.storage.products.product import Product
 from simulators.bench.scene import Scene
 from tests.rig_files import write_rig
 
+# The campaign that all of them share is what takes its time.
+pytestmark = pytest.mark.long
 SHAPE = (96, 112)
 UNDECLARED = [
     {"kind": "pixel_response", "sigma": 0.05},
@@ -76,7 +78,6 @@ def unevenness(found: np.ndarray, truth: np.ndarray, good: np.ndarray) -> float:
     return float(np.std(ratio) / np.mean(ratio))
 
 
-@pytest.mark.long
 def test_references_come_at_the_stated_intervals(campaign):
     taken = [path.stem.split("_", 1)[1] for path in sorted(campaign.glob("*.h5"))]
     drr = [name for name in taken if "drr" in name]
@@ -94,7 +95,6 @@ def test_references_come_at_the_stated_intervals(campaign):
             assert capture.column("saturated_fraction").max() < 1e-3
 
 
-@pytest.mark.long
 def test_campaign_products_use_the_nearest_flat(campaign, products):
     for name, flat in (("003_red_sphere_drr_662nm_omega40", "002"), ("007_red_sphere_drr_662nm_omega60", "006")):
         with Product(products / f"{name}.mueller.h5") as product:
