@@ -14,9 +14,11 @@ import xarray as xr
 
 from acquisition.capture.state_file import StateFile
 from processing.commands.application import main
+from processing.export import export
 from processing.geometry.rusinkiewicz import Angles
 from processing.labelled import open_dataset
 from processing.reflectance.tables import ScatteringTable
+from processing.steps.maps import Xi0
 from processing.steps.reduction import Reduction
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import CaptureHeader
@@ -266,6 +268,34 @@ def test_exported_tables_read_back_exactly(exported, product, capture):
     assert "# simulated: 1" in path.read_text()
     at = lines[0].split(",").index("psa_deg")
     assert [float(line.split(",")[at]) for line in lines[1:]] == list(open_dataset(capture)["psa_deg"].values)
+
+
+@pytest.mark.parametrize("to", ["csv", "mat", "fits", "tiff"])
+def test_noise_and_the_instruments_part_leave_with_their_names(capture, configs, tmp_path, to):
+    """In every format, and in the arrays of a notebook; of xi0 with what is uncertain."""
+    from astropy.io import fits
+    from scipy.io import loadmat
+
+    text = (configs / "instruments/drr_5to1.yaml").read_text()
+    stated = tmp_path / "stated.yaml"
+    stated.write_text(re.sub(r"retardance_deg: ([0-9.]+)", r"retardance_deg: {value: \1, u: 0.3}", text))
+    product = Xi0(Reduction(capture, stated).make(tmp_path / "m.mueller.h5")).make()
+    names, there = ["xi0_errors", "xi0_systematic"], open_dataset(product)
+    assert "retardance_deg" in there.attrs["uncertain_in_the_instrument"]
+    files = export(product, to, tmp_path / "x", names)
+    if to == "csv":
+        read = pandas.read_csv(files[0], comment="#")
+        assert "retardance_deg" in files[0].read_text()
+    elif to == "mat":
+        read = {name: values.ravel() for name, values in loadmat(files[0]).items() if name in names}
+    elif to == "fits":
+        with fits.open(files[0]) as hdus:
+            read = {name: hdus[name].data.ravel() for name in names}
+    else:
+        assert [path.name for path in files] == [f"x.{name}.tif" for name in names]
+        return
+    for name in names:
+        np.testing.assert_array_equal(np.asarray(read[name], np.float32), there[name].values.ravel().astype(np.float32))
 
 
 def test_an_exported_scattering_table_reads_back_exactly(tmp_path, table, capsys):
