@@ -6,6 +6,7 @@ import errno
 import multiprocessing
 import os
 import pickle
+import signal
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,8 +30,9 @@ from acquisition.capture.writer import (
     mark_not_taken,
     seal_whole,
 )
-from acquisition.disc import on_disc
+from acquisition.disc import disc, on_disc
 from acquisition.errors import AcquisitionError
+from acquisition.stop_request import StopRequest
 from drivers.motion import Position
 from processing.instrument.states import StateTable
 from processing.storage.captures.capture import Capture
@@ -251,6 +253,19 @@ def test_an_error_of_the_disc_is_told_at_once_and_by_the_next_call(create, monke
     for call in (lambda: writer.put(record(1)), writer.settle, lambda: writer.seal("complete", {})):
         with pytest.raises(AcquisitionError, match=r"Input/output error\). States done before it are intact"):
             call()
+
+
+def test_a_state_for_a_disc_process_that_has_ended_is_refused_at_once(create, caplog):
+    """What would be told of it by another thread would be raised where nobody hears it."""
+    writer = create()
+    os.kill(disc()._pid, signal.SIGKILL)
+    with pytest.raises(AcquisitionError, match="has ended"):
+        writer.forget()
+    with StopRequest() as stop, stop.failing_here():
+        writer.on_failure = stop.fail
+        with pytest.raises(AcquisitionError, match="has ended"):
+            writer.put(record(0))
+    assert not caplog.records
 
 
 @pytest.mark.parametrize(
