@@ -59,7 +59,7 @@ def of_gaps(first: Array, second: Array) -> Sorted:
     >>> import numpy as np
     >>> found = of_gaps(np.array([1.0, 20.0]), np.array([1.0, 20.0]))
     >>> found.half[0].round(1).tolist(), bool(found.middle[0, 0] < -1)
-    ([1.1, 0.8], True)
+    ([0.7, 0.9], True)
     """
     one, other = (_shifts(*gaps) for gaps in ((first, second), (second, first)))
     # The smallest is the largest of the matrix with the opposite sign, and the middle one stays the middle one.
