@@ -176,9 +176,12 @@ def test_a_browser_keeps_a_region_and_finds_it_on_another_capture(
     page.locator("#region-table").get_by_text("spot").wait_for()
     page.locator("#region-histogram .bars").first.wait_for()
     page.goto(f"{address}/product?file=one.mueller.h5")
-    page.get_by_label("Quantity of the regions").select_option("m11 over m00")
-    # Two digits of error, and the value ends where it does.
     mean = page.locator("#region-table tr").nth(1).locator("td").nth(3)
+    before = mean.inner_text()
+    page.get_by_label("Quantity of the regions").select_option("m11 over m00")
+    # The table is drawn anew once the answer is there; what was copied before is no longer said.
+    expect(mean).not_to_have_text(before)
+    # Two digits of error, and the value ends where it does.
     expect(mean).to_have_text(re.compile(r"^0\.\d+ ± 0\.0*[1-9]\d$"))
     # What is copied is the table, tabs between its columns, as a spreadsheet takes it.
     page.evaluate("navigator.clipboard.writeText('before')")

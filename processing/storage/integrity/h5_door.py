@@ -67,7 +67,10 @@ def _require_own(h5: h5py.File) -> None:
                 if made.get_layout() == h5py.h5d.VIRTUAL or made.get_external_count():
                     return f"{one_line(name.decode(errors='replace'))} lies in another file"
         elif link.type != h5py.h5l.TYPE_SOFT:
-            return f"{one_line(name.decode(errors='replace'))} is a link into another file"
+            place = name.decode(errors="replace")
+            other = h5.get(place, getlink=True)
+            of = f", {one_line(other.filename)}" if isinstance(other, h5py.ExternalLink) else ""
+            return f"{one_line(place)} is a link into another file{of}"
         return f"more than {MOST_LINKS:,} parts" if count > MOST_LINKS else None
 
     try:
