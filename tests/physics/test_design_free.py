@@ -126,7 +126,7 @@ def test_command_writes_a_plan_that_acquire_takes(configs, tmp_path):
 
     states = MeasurementPlan.load(plan).states
     assert states.states == 24
-    assert set(states.angles_deg()) == {"psg", "psa"}
+    assert set(states.angles_deg({})) == {"psg", "psa"}
     wrong = CliRunner().invoke(app, [*options, "--optimize", "angles", "--speed", "arm=3"])
     assert "the instrument turns" in str(wrong.exception)
 
