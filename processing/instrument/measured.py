@@ -27,7 +27,9 @@ class MeasuredMatrix(Section):
         description="for each state, and in it for each channel: 16 numbers for M row by row, or 4 for S"
     )
     u: float = Field(default=0.0, ge=0, description="standard uncertainty of every number of W")
-    tolerance_deg: float = Field(default=0.1, gt=0, description="most that a state of a capture is away, degrees")
+    tolerance_deg: float = Field(
+        default=0.1, gt=0, description="most that a state is away, degrees; for an axis of volts give a smaller number"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -75,8 +77,9 @@ class MeasuredMatrix(Section):
             state = int(np.flatnonzero(far)[0])
             place = ", ".join(f"{axis} {column[state]:g}" for axis, column in asked.items())
             raise ProcessError(
-                f"state {state} has {place} degrees, and W was measured at no such state within "
-                f"{self.tolerance_deg:g} degrees. Take the states of the instrument file, or measure W at these."
+                f"state {state} has {place}, and W was measured at no such state within "
+                f"{self.tolerance_deg:g} degrees (or volts). Take the states of the instrument file, or measure W at "
+                "these."
             )
         rows = np.zeros((len(self.rows), 16))
         given = np.array(self.rows)
