@@ -166,10 +166,14 @@ class Dc2200(LightSource):
             for _ in range(2):
                 self._device.drop_input()
                 self._device.write(query)
-                answer = self._device.read(self.config.reply_s)
-                if answer is not None and form.fullmatch(answer):
-                    return answer
-                seen += [] if answer is None else [answer]
+                # A late answer of the query before may come first.
+                for _ in range(2):
+                    answer = self._device.read(self.config.reply_s)
+                    if answer is None:
+                        break
+                    if form.fullmatch(answer):
+                        return answer
+                    seen.append(answer)
         asked = f"{self._name}, {query}"
         if seen:
             raise ReplyError(asked, f"no sense in {seen}", "Check the cable")
