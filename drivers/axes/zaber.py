@@ -245,8 +245,9 @@ class ZaberAxis(MotionAxis):
     def _find(self) -> tuple[int, str]:
         """Return address and serial number of the device that the rig file means."""
         config = self.config
-        # An answer can be late: the chain is as long as it was the last time.
-        found = agreed(lambda: self._line.ask_all("get system.serial"))
+        # An answer can be late: the chain is as long as it was the last time, and silence is asked once more.
+        ask = partial(self._line.ask_all, "get system.serial")
+        found = agreed(ask) or agreed(ask)
         listed = ", ".join(f"address {address}: serial {serial}" for address, serial in found)
         asked = f"axis {self.name}, find Zaber device on {config.port}"
         if not found:

@@ -99,7 +99,7 @@ def test_frames_without_noise_are_refused_in_words(synthetic_capture, gain):
 
 def test_a_state_that_was_not_measured_is_refused_by_its_angles():
     model = InstrumentModel.model_validate(measured(states_of(6)))
-    with pytest.raises(ProcessError, match=r"state 1 has state 2.5 degrees.*no such state"):
+    with pytest.raises(ProcessError, match=r"state 1 has state 2.5, .*no such state"):
         model.rows({"state": [1.0, 2.5]})
     assert model.rows({"state": [5.05]}).shape == (1, 1, 16)
 
