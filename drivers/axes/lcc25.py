@@ -27,7 +27,6 @@ from drivers.serial_link import LineRegistry, SerialLink, Transcript
 BAUDRATE = 115200
 HIGHEST_V = 25.0
 ALTERNATES, VOLTAGE_1 = 0, 1
-# As often as drivers may send a value: the controller takes millivolts.
 _VOLTS = re.compile(r"\d+(?:\.\d+)?")
 _MODE = re.compile(r"[012]")
 _FLAG = re.compile(r"[01]")

@@ -1,8 +1,8 @@
 """Newport Oriel Cornerstone monochromators (130, 260 and their B versions), with the shutter that is built in.
 
 Lines that end in CR LF, over RS-232 (9600 8N1, where the instrument repeats a statement before it answers) or as a
-serial port on USB (no echo). `INFO?` model, `WAVE?` nm, `GOWAVE 500`, `SHUTTER?` C or O, `SHUTTER O`, `STB?` and
-`ERROR?` for the last error. A move holds up the answers until it ends.
+serial port on USB (no echo). `INFO?` model, `WAVE?` nm, `GOWAVE 500`, `SHUTTER?` C or O, `SHUTTER O`, and `ERROR?`
+for the last error. A move holds up the answers until it ends.
 
 Sources: user manuals MCS260 (pages 49 to 51) and MCS260B (pages 45, 46, 62), the public drivers oriel-cornerstone-260
 and two for the CS260. Gratings, filters and slits stay as they are set. Unverified on hardware: everything; that a

@@ -322,18 +322,20 @@ def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0)
     mixed, mean = unit * (1 - apart), (1 - found.xi0) / 3
     shrunk = np.stack([found.xi0, *(mean + real * deviation)])
     spread = np.stack([found.stderr, *np.hypot(errors[1:], mixed)])
+    # The table is of even noise; noise that differs between the processes scales its intervals. No theory gives these
+    # factors: docs/error-bars.md has what they cover.
     own = errors[1:] / (np.sqrt(0.75) * unit)
-    of_all = np.maximum(np.sqrt(np.mean(own**2, axis=0)), 1)
-    with_mean, alone = three.with_mean(found.stderr / (3 * unit)), three.with_mean(np.zeros_like(unit))
-    near, wide = unit * (of_all + apart * (own - of_all)), unit * np.maximum(own, of_all)
+    common = np.maximum(np.sqrt(np.mean(own**2, axis=0)), 1)
+    scale_68, scale_95 = unit * (common + apart * (own - common)), unit * np.maximum(own, common)
+    with_mean, without_mean = three.with_mean(found.stderr / (3 * unit)), three.with_mean(np.zeros_like(unit))
     deviation = deviation + unit * three.middle
     xi = mean + deviation
-    low, high = xi - wide * with_mean.below, xi + wide * with_mean.above
+    low, high = xi - scale_95 * with_mean.below, xi + scale_95 * with_mean.above
     _put(
         planes,
         "coherency_eigenvalues",
         np.stack([found.xi0, *xi]),
-        np.stack([found.stderr, *(near * with_mean.half)]),
+        np.stack([found.stderr, *(scale_68 * with_mean.half)]),
         np.stack([found.interval_95[0], *low]),
         np.stack([found.interval_95[1], *high]),
     )
@@ -341,9 +343,9 @@ def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0)
         planes,
         "eigenvalue_deviation",
         deviation,
-        near * alone.half,
-        deviation - wide * alone.below,
-        deviation + wide * alone.above,
+        scale_68 * without_mean.half,
+        deviation - scale_95 * without_mean.below,
+        deviation + scale_95 * without_mean.above,
     )
     missed = planes["td_missed"].astype(float)
     planes["td_missed_noise"] = (missed * np.sqrt(noise.others / observed)).astype(np.float32)
