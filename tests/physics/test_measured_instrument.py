@@ -5,6 +5,7 @@ import pytest
 import yaml
 
 from processing.diagnosis.instrument.diagnose import diagnose_captures
+from processing.diagnosis.instrument.structure import correlates_of
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
@@ -141,3 +142,12 @@ def test_a_gain_has_an_uncertainty_and_can_be_nominal():
         {"name": "two beams", "generator": [], "analyzer": [], "channels": channels, "calibrate": ["r.gain"]}
     )
     assert (model.channels[0].gain, model.stderr, model.value_of("r.gain")) == (1.02, {"t.gain": 0.01}, 1.0)
+
+
+def test_a_residual_that_is_equal_everywhere_correlates_with_nothing():
+    """The mean of 600 times this number rounds to another one: its standard deviation is not zero."""
+    numbers = np.linspace(1, 2, 500, dtype=np.float32)
+    number = next(x for x in numbers if np.full(600, np.sqrt(x * x)).std() > 0)
+    left = np.full((1, 20, 30), number, dtype=np.float32)
+    signal = np.broadcast_to(np.arange(30, dtype=np.float32), left.shape)
+    assert correlates_of(left, signal, np.ones((20, 30), dtype=bool)) == {}

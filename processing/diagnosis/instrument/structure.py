@@ -130,7 +130,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
         mean=mean,
         tests=tests,
         harmonics=harmonics,
-        correlates=_correlates(r, signal, good),
+        correlates=correlates_of(r, signal, good),
         leading=vector[:, -1],
         leading_share=float(value[-1] / max(value.sum(), 1e-300)),
         left=left,
@@ -261,7 +261,11 @@ def _patches(r: NDArray[np.float32], expected: NDArray[np.float32], spread: floa
     return float((np.sum(total**2) - null.sum()) / pixels), float(deviation / pixels)
 
 
-def _correlates(r: NDArray[np.float32], signal: NDArray[np.float32], good: NDArray[np.bool_]) -> dict[str, float]:
+def correlates_of(r: NDArray[np.float32], signal: NDArray[np.float32], good: NDArray[np.bool_]) -> dict[str, float]:
+    """Correlation of the size of a residual r (L, rows, columns) with maps of the image, over the good pixels.
+
+    A map, or a residual, that is equal everywhere correlates with nothing and is left out.
+    """
     if good.sum() < FEWEST_PIXELS or min(r.shape[1:]) < 3:
         return {}
     loud = np.sqrt(np.mean(np.nan_to_num(r) ** 2, axis=0))
@@ -273,7 +277,8 @@ def _correlates(r: NDArray[np.float32], signal: NDArray[np.float32], good: NDArr
     out = {}
     for name, image in maps.items():
         x, y = loud[good], image[good]
-        if x.std() > 0 and y.std() > 0:
+        # The mean of equal numbers may round to another one, so that their standard deviation is not zero.
+        if np.ptp(x) > 0 and np.ptp(y) > 0:
             out[name] = float(np.corrcoef(x, y)[0, 1])
     return out
 
