@@ -1,8 +1,9 @@
 """OptoSigma (Sigma Koki) GSC-01, GSC-02 and other controllers with SHOT commands, and rotation stages.
 
-Facts: the public drivers elerac/optosigma (which quotes the manuals of GSC-01 and GSC-02), pysigmakoki, PyOptoSigma and
-pymodaq_plugins_optosigma. Moves are relative, because a GSC-02 has no others. The controller tells neither speed nor
-limits, nor whether it is homed, and it takes no move while one of its axes moves: one axis of it can be in a rig.
+Documents: Sigma Koki's "GSC-01 User's Manual", sixth edition (2017.9), and "GSC-02 User's Manual", seventh edition
+(2019.4), chapters 3; also the public drivers elerac/optosigma, pysigmakoki and PyOptoSigma. Moves are relative, because
+a GSC-02 has no others. The controller tells neither speed nor limits, nor whether it is homed, and it takes no move
+while one of its axes moves: one axis of it can be in a rig. Other controllers with SHOT commands are taken for a GSC-01.
 Unverified on hardware: everything; that a GSC-01 keeps the result of a command until the next.
 """
 
@@ -24,7 +25,7 @@ from drivers.text_line import TextLine
 # Pulses a second, and milliseconds from start to this speed: the homing of a GSC-01 and a GSC-02.
 HOMING_PPS = 5000
 # The sign stands apart from its digits, with blanks and nothing else between.
-_STATUS = re.compile(r" *([+-]? *\d+ *, *)+[XK],[KLMW],[BR]")
+_STATUS = re.compile(r" *([+-]? *\d+ *, *)+[XK] *, *[KLMW] *, *[BR] *")
 _VERSION = re.compile(r"(?!OK$|NG$)[\w .-]+")
 # At a limit switch: the first axis, the second, both.
 _AT_LIMIT = {"L": (1,), "M": (2,), "W": (1, 2)}
@@ -42,7 +43,7 @@ class Config(SessionReferenceConfig):
     speed_pps: float = Field(default=5000.0, gt=0, description="speed of moves as set, pulses a second, for deadlines")
     acceleration_s: float = Field(default=0.2, gt=0, description="time to that speed, as set")
     home_direction: Literal["+", "-"] | None = Field(
-        default=None, description="way to the origin, which a GSC-02 must be told and other controllers know"
+        default=None, description="way to the origin: for a GSC-02, and for it alone"
     )
     baudrate: int = Field(default=9600, description="bits a second, as the controller is set")
     rtscts: bool = Field(default=True, description="whether the wires RTS and CTS hold back who sends too fast")
@@ -77,6 +78,8 @@ class GSCAxis(SessionReferenceAxis):
         self.counts_per_deg = config.pulses_per_deg
         self.speed_deg_s = config.speed_pps / config.pulses_per_deg
         self.acceleration_deg_s2 = self.speed_deg_s / config.acceleration_s
+        # Of all controllers a GSC-02 alone is told the way home, and drives at a letter without a colon.
+        self._drive = "G" if config.home_direction else "G:"
         self._home_speed_deg_s = HOMING_PPS / config.pulses_per_deg
         self._identity = AxisIdentity(
             kind=config.kind,
@@ -123,7 +126,7 @@ class GSCAxis(SessionReferenceAxis):
         way = round(counts) - int(self._read_confirmed()[0])
         self._begin_moving()
         if way:
-            self._command(f"M:{self.config.axis}{'+' if way > 0 else '-'}P{abs(way)}", "G:")
+            self._command(f"M:{self.config.axis}{'+' if way > 0 else '-'}P{abs(way)}", self._drive)
 
     def _do_start_home(self) -> None:
         self._begin_homing()

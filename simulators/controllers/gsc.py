@@ -1,11 +1,15 @@
-"""OptoSigma GSC-01 and GSC-02: a move is set, then driven; the first acknowledges each command, the second does not."""
+"""OptoSigma GSC-01 and GSC-02: a move is set, then driven; the first acknowledges each command, the second does not.
+
+Commands, ranges and answers are those of the two manuals that `drivers.axes.gsc` names. `?:SW` is a SHOT-302GS's.
+"""
 
 from __future__ import annotations
 
+import math
 import re
 from functools import partial
 
-from drivers.axes.gsc import Config
+from drivers.axes.gsc import HOMING_PPS, Config
 from simulators.clock import FastClock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.line_collector import LineCollector
@@ -13,10 +17,14 @@ from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
 
 PULSES_PER_DEG = 400.0
-MOST_PULSES = 16_777_214
+MOST_PULSES = 16_777_215
 _SET = re.compile(r"([MA]):([12W])(?=[+-])((?:[+-]P\d{1,8})+)")
 _JOG = re.compile(r"J:([12W])([+-]+)")
-_SPEED = re.compile(r"D:[12](?:S(\d{1,6})F(\d{1,6})R(\d{1,4}))+")
+_SPEED = re.compile(r"D:([12W])((?:S\d{1,5}F\d{1,5}R\d{1,4}){1,2})")
+# Lowest and highest speed, pulses a second; a GSC-02 has two ranges.
+SPEEDS = {"1": (1, 200), "2": (50, 20_000)}
+SPEEDS_OF_A_GSC_01 = (100, 20_000)
+LONGEST_RAMP_MS = 1000
 
 
 class GSCEmulator(Emulator):
@@ -32,6 +40,7 @@ class GSCEmulator(Emulator):
         self.acknowledges = acknowledges
         self._lines = LineCollector()
         self._taken = True
+        self._free = False
         # What the next drive does: for each axis a target in degrees, or a direction of jogging.
         self._next: dict[int, float | str] = {}
 
@@ -46,8 +55,10 @@ class GSCEmulator(Emulator):
                 self._line(text)
 
     def _line(self, text: str) -> None:
-        divisions = ",".join("2" for _ in self.axes)
-        answers = {"Q:": self._status(), "!:": self._busy(), "?:V": "V1.10", "?:-": "3", "?:SW": divisions}
+        answers = {"Q:": self._status(), "!:": self._busy(), "?:V": "V1.10"}
+        if self.acknowledges:
+            text = text.upper()
+            answers |= {"?:-": "001", "?:SW": "2"}
         if text in answers:
             self._reply(f"{answers[text]}\r\n".encode())
             return
@@ -62,7 +73,9 @@ class GSCEmulator(Emulator):
         # Signs stand at the left of ten places.
         pulses = [self.pulses(index) for index in range(len(self.axes))]
         places = [f"{'-' if count < 0 else ' '}{abs(count):9d}" for count in pulses]
-        return ",".join((*places, "K" if self._taken else "X", "K", self._busy()))
+        stopped = [not axis.is_moving() and axis.position_deg() in (axis.min_deg, axis.max_deg) for axis in self.axes]
+        at_limit = "W" if stopped == [True, True] else "L" if stopped[0] else "M" if any(stopped) else "K"
+        return ",".join((*places, "K" if self._taken else "X", at_limit, self._busy()))
 
     def _chosen(self, which: str) -> list[int]:
         indices = list(range(len(self.axes))) if which == "W" else [int(which) - 1]
@@ -73,37 +86,60 @@ class GSCEmulator(Emulator):
         stop = re.fullmatch(r"L:([12WE])", text)
         if stop is not None:
             return self._stop("W" if stop[1] == "E" else stop[1])
-        if self._busy() == "B":
+        if self._busy() == "B" or (self._free and text[0] in "HMAJG"):
             return False
         if (move := _SET.fullmatch(text)) is not None:
+            if move[1] == "A" and not self.acknowledges:
+                return False
             return self._set(move[1] == "A", self._chosen(move[2]), re.findall(r"([+-])P(\d+)", move[3]))
         if (jog := _JOG.fullmatch(text)) is not None:
             chosen = self._chosen(jog[1])
             self._next = dict(zip(chosen, jog[2], strict=False))
             return bool(chosen) and len(chosen) == len(jog[2])
-        if text in ("G:", "G"):
+        if text == ("G:" if self.acknowledges else "G"):
             return self._drive()
         if (speed := _SPEED.fullmatch(text)) is not None:
-            self.axes[0].speed_deg_s = max(int(speed[2]), 1) / PULSES_PER_DEG
-            return True
+            return self._set_speeds(speed[1], re.findall(r"S(\d+)F(\d+)R(\d+)", speed[2]))
         # A GSC-02 must be told the direction; a GSC-01 knows it.
         home = re.fullmatch(r"H:([12W])([+-]{0,2})", text)
         if home is not None and bool(home[2]) != self.acknowledges:
             for index in self._chosen(home[1]):
-                self.axes[index].home()
+                self.axes[index].home(HOMING_PPS / PULSES_PER_DEG)
             self._next = {}
             return bool(self._chosen(home[1]))
         if (zero := re.fullmatch(r"R:([12W])", text)) is not None:
             for index in self._chosen(zero[1]):
                 self.axes[index].call_position(0.0)
             return bool(self._chosen(zero[1]))
-        return re.fullmatch(r"C:[12W][01]{1,2}", text) is not None
+        hold = re.fullmatch(r"C:([12W])([01]{1,2})", text)
+        if hold is None or not self._chosen(hold[1]):
+            return False
+        # What a free motor of a GSC-02 answers is not told.
+        self._free = self.acknowledges and hold[2] == "0"
+        return True
+
+    def _set_speeds(self, which: str, speeds: list[tuple[str, str, str]]) -> bool:
+        low, high = SPEEDS_OF_A_GSC_01 if self.acknowledges else SPEEDS.get(which, (1, 0))
+        numbers = [(int(start), int(top), int(ramp)) for start, top, ramp in speeds]
+        if len(numbers) != len(self.axes) or not all(
+            low <= start <= top <= high and ramp <= LONGEST_RAMP_MS for start, top, ramp in numbers
+        ):
+            return False
+        for axis, (_, top, ramp) in zip(self.axes, numbers, strict=True):
+            # A GSC-01 counts in hundreds.
+            axis.speed_deg_s = (top // 100 * 100 if self.acknowledges else top) / PULSES_PER_DEG
+            axis.acceleration_deg_s2 = axis.speed_deg_s * 1000 / ramp if ramp else math.inf
+        return True
 
     def _set(self, absolute: bool, chosen: list[int], pulses: list[tuple[str, str]]) -> bool:
         counts = [int(sign + digits) for sign, digits in pulses]
-        if len(chosen) != len(counts) or not chosen or max(map(abs, counts)) > MOST_PULSES:
-            return False
         starts = [0 if absolute else self.pulses(index) for index in chosen]
+        if len(chosen) != len(counts) or not chosen:
+            return False
+        ends = [abs(start + count) for start, count in zip(starts, counts, strict=True)]
+        # The manual of the GSC-01 limits the coordinate, that of the GSC-02 the way.
+        if max(ends if self.acknowledges else map(abs, counts)) > MOST_PULSES - (not self.acknowledges):
+            return False
         self._next = {
             index: (start + count) / PULSES_PER_DEG for index, start, count in zip(chosen, starts, counts, strict=True)
         }
@@ -115,8 +151,9 @@ class GSCEmulator(Emulator):
             axis = self.axes[index]
             if isinstance(what, str):
                 axis.run(axis.speed_deg_s / 10 * (1 if what == "+" else -1))
-            elif axis.within(what):
-                axis.move_to(what)
+            else:
+                low = -math.inf if axis.min_deg is None else axis.min_deg
+                axis.move_to(min(max(what, low), math.inf if axis.max_deg is None else axis.max_deg))
         return bool(nexts)
 
     def _stop(self, which: str) -> bool:

@@ -73,6 +73,17 @@ def test_gsc_moves_are_relative_and_asked_for() -> None:
             gsc.open("psa", gsc.Config(port=path, axis=2), lines)
 
 
+def test_a_gsc_02_is_driven_by_a_letter_without_a_colon() -> None:
+    # Blanks as the manuals print them.
+    rest = (b"Q:\r\n", b"-       400,         0, K, K, R\r\n")
+    with (
+        scripted((b"?:V\r\n", b"V2.00\r\n"), *[rest] * 3, (b"M:1+P1200\r\n", b""), rest, (b"G\r\n", b""), rest) as path,
+        LineRegistry(clock=patient_clock()) as lines,
+    ):
+        axis = gsc.open("psg", gsc.Config(port=path, home_direction="-", assume_homed=True, rtscts=False), lines)
+        axis._do_start_move(800.0)
+
+
 def test_a_disturbed_blank_in_a_status_of_a_gsc_is_asked_for_again() -> None:
     with (
         scripted(

@@ -294,6 +294,37 @@ def test_gsc_sets_a_move_and_drives_it() -> None:
     assert talk(box, b"Q:\r\n") == b"-     4000,K,K,R\r\n"
     assert talk(box, b"A:1+P20000000\r\n") == b"NG\r\n"
     assert box.true_deg(0) == -10.0
+    # The coordinate after the move counts; letters may be small; a free motor obeys no move.
+    assert talk(box, b"A:1+P16777215\r\nM:1-P16777215\r\n") == b"OK\r\nNG\r\n"
+    assert talk(box, b"?:-\r\nG\r\nc:10\r\n") == b"001\r\nNG\r\nOK\r\n"
+    assert talk(box, b"M:1+P400\r\nH:1\r\nC:11\r\nm:1+p400\r\n") == b"NG\r\nNG\r\nOK\r\nOK\r\n"
+
+
+def test_a_gsc_stops_at_the_end_of_its_travel_and_says_so() -> None:
+    for kind, status in (
+        ("gsc-01", b"      4000,K,L,R\r\n"),
+        ("gsc-02", b"      4000,         0,K,L,R\r\n"),
+    ):
+        box, clock = emulator(kind, limits_deg=(-10.0, 10.0))
+        box.axes[0].call_position(0.0)
+        for text in (b"M:1+P8000\r\n", b"G:\r\n" if kind == "gsc-01" else b"G\r\n"):
+            talk(box, text)
+        clock.sleep_s(60.0)
+        assert talk(box, b"Q:\r\n") == status
+        assert box.axes[0].position_deg() == 10.0
+
+
+def test_speeds_of_a_gsc_belong_to_their_axes() -> None:
+    box, _ = emulator("gsc-02")
+    assert talk(box, b"D:2S100F4000R200S500F8000R0\r\nQ:\r\n").endswith(b",K,K,R\r\n")
+    assert [axis.speed_deg_s for axis in box.axes] == [10.0, 20.0]
+    assert box.axes[0].acceleration_deg_s2 == pytest.approx(50.0)
+    for wrong in (b"D:1S100F4000R200S100F100R0", b"D:2S100F4000R200", b"D:2S40F4000R200S100F4000R200"):
+        assert talk(box, wrong + b"\r\nQ:\r\n").endswith(b",X,K,R\r\n")
+    box, _ = emulator("gsc-01")
+    assert talk(box, b"D:1S500F4050R200\r\nD:1S50F5000R200\r\n") == b"OK\r\nNG\r\n"
+    # Whole hundreds of pulses.
+    assert box.axes[0].speed_deg_s == 10.0
 
 
 def test_a_gsc_02_is_silent_and_must_be_told_the_way_home() -> None:
@@ -305,6 +336,10 @@ def test_a_gsc_02_is_silent_and_must_be_told_the_way_home() -> None:
     assert talk(box, b"L:W\r\n") == b""
     clock.sleep_s(60.0)
     assert not box.axes[0].homed
+    # It drives at a letter alone and has relative moves only.
+    assert talk(box, b"M:W+P400-P800\r\nG:\r\nQ:\r\n").endswith(b",X,K,R\r\n")
+    assert talk(box, b"A:1+P400\r\nQ:\r\n").endswith(b",X,K,R\r\n")
+    assert talk(box, b"M:1+P16777215\r\nQ:\r\n").endswith(b",X,K,R\r\n")
     assert talk(box, b"M:W+P400-P800\r\nG\r\n") == b""
     clock.sleep_s(60.0)
     assert talk(box, b"Q:\r\n") == b"       400,-      800,K,K,R\r\n"

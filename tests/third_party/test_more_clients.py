@@ -256,7 +256,7 @@ def test_pysigmakoki() -> None:
             box.waitForReady(10)
             assert [axis.homed for axis in emulator.axes] == [True, True]
             box.setSpeed(True, 100, 5000, 200, 100, 5000, 200)
-            box.move_absolute(4000, -2000)
+            box.move(4000, -2000)
             box.waitForReady(10)
             box.move_relative(-400, 400)
             box.waitForReady(10)
