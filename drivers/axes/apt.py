@@ -1,9 +1,10 @@
 """Thorlabs APT controllers over their binary protocol: K10CR1, K10CR2, KDC101, KBD101, KST101, racks BSC20x and BBD20x.
 
-Facts: public drivers (pylablib, qmi, thorlabs-apt-protocol, thorlabs-apt-device, PnPQ) and their issues. A plain serial
-port is enough on Linux, no vendor's driver. States are read, the messages at the end of a motion are not relied on:
-they go missing on real units (PnPQ#104). Counts per degree and the units of speed and acceleration are those of qmi and
-pylablib. The units in the bays of a rack share its port.
+Documents: Thorlabs' "Motion Controllers Host-Controller Communications Protocol", issue 28 of September 2021: addresses
+and routing (page 36), counts per degree and units of speed and acceleration (pages 39 and 41), bits of the status
+(pages 126 and 127). The K10CR2 is newer. Further facts: public drivers (pylablib, qmi, thorlabs-apt-protocol, PnPQ) and
+their issues. A plain serial port is enough on Linux. States are read, the messages at the end of a motion are not
+relied on: they go missing on real units (PnPQ#104). The units in the bays of a rack share its port.
 Unverified on hardware: everything of the KBD101, the KST101 and the racks.
 """
 

@@ -3,7 +3,7 @@
 Documents: Sigma Koki's "GSC-01 User's Manual", sixth edition (2017.9), and "GSC-02 User's Manual", seventh edition
 (2019.4), chapters 3; also the public drivers elerac/optosigma, pysigmakoki and PyOptoSigma. Moves are relative, because
 a GSC-02 has no others. The controller tells neither speed nor limits, nor whether it is homed, and it takes no move
-while one of its axes moves: one axis of it can be in a rig. Other controllers with SHOT commands are taken for a GSC-01.
+while one of its axes moves: one axis of it can be in a rig. Other SHOT controllers are taken for a GSC-01.
 Unverified on hardware: everything; that a GSC-01 keeps the result of a command until the next.
 """
 

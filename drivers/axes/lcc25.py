@@ -1,11 +1,13 @@
 """Thorlabs LCC25: the voltage at a liquid-crystal retarder, as an axis of volts with named states.
 
-115200 8N1, the line of `drivers.prompt_line`: `*idn?`, `volt1?` and `volt1=1.530` (volts RMS, 0 to 25), `mode?` (1 for
-voltage 1, 2 for voltage 2, 0 for a change between the two), `enable?`. The driver uses voltage 1.
+115200 8N1, the line of `drivers.prompt_line`: an empty line, which wakes it, `*idn?`, `volt1?`, `volt1=1.5300` (volts
+RMS, 0 to 25), `mode?` (1 for voltage 1, 2 for voltage 2, 0 for a change between the two), `enable?`. The driver uses
+voltage 1.
 
-Facts: the public drivers of InstrumentKit and hyperion, and a public simulator (mrfalcon77/LCC25); Thorlabs' manual of
-the LCC25 was searched for and not found. The controller does not see the crystal: `settle_s` is the time that it takes.
-Unverified on hardware: everything.
+Documents: Thorlabs' own serial example (github.com/Thorlabs/Light_Control_and_Manipulation_Examples, C#/LCC25), and the
+commands and descriptions of its library LCC25CommandLib, which has every command above; the manual itself was not
+found. The controller does not see the crystal: `settle_s` is the time that it takes.
+Unverified on hardware: everything; form of the answers to `mode?` and `enable?` (public drivers: a number).
 """
 
 from __future__ import annotations
@@ -61,6 +63,8 @@ class LCC25Axis(MotionAxis):
         self._lines = lines
         asked = f"liquid-crystal controller on {config.port}"
         self._line = PromptLine(link, asked, config.reply_s or 1.0)
+        # Thorlabs' example: it takes commands after an empty one, which it refuses.
+        self._line.tell("")
         identity = self._line.ask("*idn?")
         if "LCC25" not in identity.upper() or config.identity not in (None, identity):
             raise WrongDevice(
@@ -104,7 +108,7 @@ class LCC25Axis(MotionAxis):
         return self.clock.now_s() < self._rests_from_s
 
     def _do_start_move(self, counts: float) -> None:
-        for command in (f"volt1={counts:.3f}", f"mode={VOLTAGE_1}", "enable=1"):
+        for command in (f"volt1={counts:.4f}", f"mode={VOLTAGE_1}", "enable=1"):
             self._line.tell(command)
         self._rests_from_s = self.clock.now_s() + self.config.settle_s
 

@@ -1,9 +1,11 @@
 """OWIS position control units of the PS family (PS10, PS35, PS90) with rotation stages.
 
-Facts: the public EPICS driver motorOWISPS (table of commands, letters of the states, homing modes, lines that end in
-CR), and public programs for a PS90 over its serial line. States are one letter for each axis (``?ASTAT``). The unit
-does not tell whether an axis is homed; speed and limits are read in units that are not documented there, so the rig
-file says the speed. Unverified on hardware: everything.
+Documents: OWIS' own libraries ps90.dll and ps10.dll, whose commands and letters of motion are those used here; of the
+user manual of the PS 90 (9013.0180, 31.07.2014) only the first pages could be read. Modes of homing and lines that end
+in CR: the public EPICS driver motorOWISPS, and public programs for a PS90. States are one letter for each axis
+(``?ASTAT``). The libraries also ask ``?REFST``, whether an axis is homed; its answer is not documented there, so the
+session remembers. Speed and limits have units that are not documented either: the rig file says the speed.
+Unverified on hardware: everything.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Thorlabs SC10 beam shutter controller: shutter for dark states, interlock input for the door.
 
 Text protocol, 9600 8N1, as `drivers.prompt_line` has it. `ens` toggles the enable state, `ens?` reads it, `closed?`
-reads the blade, `interlock?` is 1 while the interlock circuit is open (command names as in the public InstrumentKit
-driver; not yet tried on the real box).
+reads the blade, `interlock?` is 1 while the interlock circuit is open (Thorlabs' SC10 user guide, rev. K of 2017, pages
+12 and 13; not yet tried on the real box).
 """
 
 from __future__ import annotations

@@ -89,8 +89,6 @@ class GSCEmulator(Emulator):
         if self._busy() == "B" or (self._free and text[0] in "HMAJG"):
             return False
         if (move := _SET.fullmatch(text)) is not None:
-            if move[1] == "A" and not self.acknowledges:
-                return False
             return self._set(move[1] == "A", self._chosen(move[2]), re.findall(r"([+-])P(\d+)", move[3]))
         if (jog := _JOG.fullmatch(text)) is not None:
             chosen = self._chosen(jog[1])
@@ -111,10 +109,13 @@ class GSCEmulator(Emulator):
             for index in self._chosen(zero[1]):
                 self.axes[index].call_position(0.0)
             return bool(self._chosen(zero[1]))
+        return self._hold(text)
+
+    def _hold(self, text: str) -> bool:
         hold = re.fullmatch(r"C:([12W])([01]{1,2})", text)
         if hold is None or not self._chosen(hold[1]):
             return False
-        # What a free motor of a GSC-02 answers is not told.
+        # What a free motor of a GSC-02 answers is not in its manual.
         self._free = self.acknowledges and hold[2] == "0"
         return True
 
@@ -134,7 +135,8 @@ class GSCEmulator(Emulator):
     def _set(self, absolute: bool, chosen: list[int], pulses: list[tuple[str, str]]) -> bool:
         counts = [int(sign + digits) for sign, digits in pulses]
         starts = [0 if absolute else self.pulses(index) for index in chosen]
-        if len(chosen) != len(counts) or not chosen:
+        # A GSC-02 has no absolute moves.
+        if len(chosen) != len(counts) or not chosen or (absolute and not self.acknowledges):
             return False
         ends = [abs(start + count) for start, count in zip(starts, counts, strict=True)]
         # The manual of the GSC-01 limits the coordinate, that of the GSC-02 the way.

@@ -19,7 +19,7 @@ SETTINGS = {
     "min": (0.0, HIGHEST_V, 3),
     "max": (0.0, HIGHEST_V, 3),
     "increment": (0.0, HIGHEST_V, 3),
-    "freq": (0.5, 150.0, 1),
+    "freq": (5.0, 150.0, 1),
     "dwell": (0.0, 1e5, 0),
     "mode": (0.0, 2.0, 0),
     "enable": (0.0, 1.0, 0),

@@ -38,6 +38,8 @@ def test_bytes_of_the_controller() -> None:
         (b"mode=2\r", b"mode=2\r> ", 4.0),
         (b"mode?\r", b"mode?\r2\r> ", 4.0),
         (b"freq=60.0\r", b"freq=60.0\r> ", 4.0),
+        (b"freq=4\r", b"freq=4\rCommand error CMD_ARG_INVALID\r> ", 4.0),
+        (b"\r", b"\rCommand error CMD_NOT_DEFINED\r> ", 4.0),
         (b"volt3?\r", b"volt3?\rCommand error CMD_NOT_DEFINED\r> ", 4.0),
     ):
         emulator.receive(sent)

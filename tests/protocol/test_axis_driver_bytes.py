@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.apt_frames import apt_framer
-from drivers.axes import apt, elliptec, esp301, gcs2, gsc, owis, smc100, zaber
+from drivers.axes import apt, elliptec, esp301, gcs2, gsc, lcc25, owis, smc100, zaber
 from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
 from drivers.serial_link import LONGEST_FRAME, LineRegistry, line_framer
 from simulators.clock import FastClock, patient_clock
@@ -94,6 +94,20 @@ def test_a_disturbed_blank_in_a_status_of_a_gsc_is_asked_for_again() -> None:
         LineRegistry(clock=patient_clock()) as lines,
     ):
         gsc.open("psg", gsc.Config(port=path, rtscts=False, reply_s=0.2), lines)
+
+
+def test_an_lcc25_is_woken_by_an_empty_line() -> None:
+    with (
+        scripted(
+            (b"\r", b"\rCommand error CMD_NOT_DEFINED\r>\n"),
+            (b"*idn?\r", b"*idn?\rTHORLABS LCC25 VERSION 1.05\r>\n"),
+            (b"volt1=1.5300\r", b"volt1=1.5300\r>\n"),
+            (b"mode=1\r", b"mode=1\r>\n"),
+            (b"enable=1\r", b"enable=1\r>\n"),
+        ) as path,
+        LineRegistry(clock=patient_clock()) as lines,
+    ):
+        lcc25.open("lcr", lcc25.Config(port=path), lines)._do_start_move(1.53)
 
 
 def test_owis_makes_an_axis_ready_before_it_goes() -> None:
