@@ -65,19 +65,26 @@ def drawn(model, random):
     return model.with_values(values)
 
 
-def products(synthetic_capture, tmp_path, model, truth, random, name="a", rows=4, **header):
-    """Mueller image, quantities and xi0 of a sample that another instrument than the model's measured."""
+def mueller_image(synthetic_capture, tmp_path, model, truth, random, name="a", rows=4, **header):
+    """Mueller image of a sample that another instrument than the model's measured."""
     light = COUNTS * truth.rows(ANGLES).reshape(-1, 16) @ SAMPLE.reshape(16)
     frames = np.broadcast_to(light[:, None, None, None], (40, 1, rows, rows)).astype(np.float32)
     if random is not None:
         frames = random.poisson(frames).astype(np.float32)
     detector = {"gain_e_per_count": 1.0, "read_noise_e": 1.0, "black_level_counts": 0.0}
     path = synthetic_capture(frames, ANGLES, name=f"{name}.h5", detector=detector, **header)
-    paths = [tmp_path / f"{name}.{kind}.h5" for kind in ("mueller", "quantities", "xi0")]
+    product = tmp_path / f"{name}.mueller.h5"
     with Capture(path) as capture:
-        reduce_mueller(capture, model, paths[0], (STEP,))
-    quantities_of_mueller(paths[0], paths[1], STEP)
-    xi0_of_mueller(paths[0], paths[2], STEP, False, progress=None)
+        reduce_mueller(capture, model, product, (STEP,))
+    return product
+
+
+def products(synthetic_capture, tmp_path, model, truth, random, name="a", **more):
+    """The Mueller image, its quantities and xi0."""
+    image = mueller_image(synthetic_capture, tmp_path, model, truth, random, name, **more)
+    paths = [image, *(tmp_path / f"{name}.{kind}.h5" for kind in ("quantities", "xi0"))]
+    quantities_of_mueller(image, paths[1], STEP)
+    xi0_of_mueller(image, paths[2], STEP, False, progress=None)
     return paths
 
 
@@ -184,8 +191,8 @@ def test_a_mueller_table_covers_an_instrument_that_is_off_and_its_noise(stated, 
     geometry, header = configs / "geometries/one_inch_sphere.yaml", {"omega_deg": 35.0, "rows": 32}
 
     def table(used, truth, random, name):
-        paths = products(synthetic_capture, tmp_path, used, truth, random, name, **header)
-        return tabulate(paths[:1], geometry, "renderer")
+        image = mueller_image(synthetic_capture, tmp_path, used, truth, random, name, **header)
+        return tabulate([image], geometry, "renderer")
 
     exact, moved, told = table(known, known, None, "e"), table(known, off, None, "m"), table(model, known, None, "t")
     assert set(exact.uncertainties) == {"u_noise"}
