@@ -103,7 +103,6 @@ class Sentence:
     site: str
     quantities: tuple[str, ...]
     course: str = ""
-    price: float = PRICE
 
     @property
     def text(self) -> str:
@@ -115,6 +114,14 @@ class Sentence:
     def of_one_capture(self) -> bool:
         """Whether it follows the time of a capture, and would be another one in the next."""
         return bool(self.course) and not self.course.startswith("by ")
+
+    def price(self, conditions: Conditions) -> float:
+        """[log odds] Prior odds against the sentence: more for a high harmonic, and for one of many states or waves."""
+        kind, _, rest = self.course.partition(" ")
+        if kind == "by":
+            return PRICE + OF_A_HARMONIC * max(int(rest.split()[0]) - 2, 0)
+        of_several = {"from": conditions.states, "beating": _beats(conditions.states).size}.get(kind, 1)
+        return PRICE + float(np.log(of_several))
 
     def parameters(self, conditions: Conditions) -> tuple[Parameter, ...]:
         """One for each quantity and each part of the course."""
@@ -284,7 +291,7 @@ def _turns(conditions: Conditions, axis: str) -> bool:
 def _waves(site: str, quantities: tuple[str, ...], axes: Sequence[str], periods: Sequence[int]) -> Iterator[Sentence]:
     for axis in axes:
         for n in periods:
-            yield Sentence(site, quantities, f"by {n} x {axis}", PRICE + OF_A_HARMONIC * max(n - 2, 0))
+            yield Sentence(site, quantities, f"by {n} x {axis}")
 
 
 def _of_element(
@@ -321,15 +328,18 @@ def _of_path(passed: Sequence[str], times: Sequence[str]) -> Iterator[Sentence]:
 
 def _jumps(site: str, quantity: str, states: int) -> Iterator[Sentence]:
     """From one state on, of which any may be it."""
-    price = PRICE + float(np.log(max(states, 1)))
-    yield from (Sentence(site, (quantity,), f"from state {k}", price) for k in range(2, states - 1))
+    yield from (Sentence(site, (quantity,), f"from state {k}") for k in range(2, states - 1))
+
+
+def _beats(states: int) -> Array:
+    """Waves over a capture, half a wave apart."""
+    return np.arange(1.5, states / 2, 0.5)
 
 
 def _of_source_and_detector(states: int, times: Sequence[str], turning: Sequence[str]) -> Iterator[Sentence]:
     yield from (Sentence("source", ("gain",), time) for time in times[1:])
     yield from _jumps("source", "gain", states)
-    beats = np.arange(1.5, states / 2, 0.5)
-    yield from (Sentence("source", ("gain",), f"beating {n:g} times", PRICE + float(np.log(beats.size))) for n in beats)
+    yield from (Sentence("source", ("gain",), f"beating {n:g} times") for n in _beats(states))
     yield from (Sentence("detector", (quantity,), time) for quantity in ("stray", "offset") for time in times)
     # Light that a moving element sends back on its way.
     yield from _waves("detector", ("stray",), turning, (1, 2, 4))

@@ -115,9 +115,20 @@ def test_every_sentence_is_read_back_from_its_text(configs):
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
     every = sentences_of(model, conditions)
     for sentence in every:
-        read = parsed(sentence.text)
-        assert (read.site, read.quantities, read.course) == (sentence.site, sentence.quantities, sentence.course)
+        assert parsed(sentence.text) == sentence
     assert "azimuth of analyzer from state 5" in [s.text for s in every]
+
+
+def test_a_sentence_is_the_less_likely_the_more_there_are_of_its_kind(configs):
+    angles = state_angles(STATES, False, False)
+    conditions = Conditions.of({axis: np.rad2deg(angle) for axis, angle in angles.items()})
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
+    every = {s.text: s.price(conditions) for s in sentences_of(model, conditions)}
+    one = every["lag of detector"]
+    assert every["stray of detector by 4 x psg"] > every["stray of detector by 2 x psg"] == one
+    for kind in ("gain of source from state", "gain of source beating"):
+        group = [price for text, price in every.items() if text.startswith(kind)]
+        assert np.exp(one - np.array(group)).sum() == pytest.approx(1, abs=0.1)
 
 
 def test_light_that_is_reflected_inside_a_plate_passes_it_three_times(configs):

@@ -45,4 +45,4 @@ class SentenceEffect(OpticsEffect):
         return signal - offset.reshape(-1, *(1,) * (signal.ndim - 1)), np.ones_like(signal)
 
     def log_price(self, model: InstrumentModel, conditions: Conditions, place: str) -> float:
-        return next(s.price for s in grammar.sentences(model, conditions) if s.text == place)
+        return grammar.parsed(place).price(conditions)
