@@ -7,7 +7,7 @@ import inspect
 import pkgutil
 from dataclasses import dataclass
 from importlib.metadata import entry_points
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 from processing.errors import ProcessError
 
@@ -38,9 +38,62 @@ class Parameter:
 
 
 class Effect:
-    """One thing that a model can lack. Its `kind` is the name of its file, whose docstring says cause and mending."""
+    """One thing that a model can lack. Its `kind` is the name of its file, whose docstring says cause and mending.
+
+    What follows is what an effect declares of itself: the diagnosis asks for it, and never for a class.
+    """
 
     kind: str = ""
+    #: Parameter k acts on state k alone (which also makes its derivative cheap).
+    per_state: ClassVar[bool] = False
+    #: On or off: its parameter is not fitted.
+    is_switch: ClassVar[bool] = False
+    #: Would have other values in another capture of the same instrument.
+    of_one_capture: bool = False
+    #: Changes the light of the source, by the same share in the whole image.
+    of_source: ClassVar[bool] = False
+    #: Changes all channels of a state by one factor: a source whose level is free (`free_source`) takes it up.
+    is_level: ClassVar[bool] = False
+    #: Changes how bright the channels are against each other, and nothing of their polarization.
+    of_channels: ClassVar[bool] = False
+    #: A known surface shows it too.
+    of_optics: ClassVar[bool] = False
+    #: Varies over the image, so that every part of it has a W of its own.
+    varies_over_image: ClassVar[bool] = False
+    #: The curve from light to counts: a detector has one, whichever of these describes it.
+    is_response: ClassVar[bool] = False
+    #: A value of the train that the instrument file gives as only nominal: always fitted, and no fault.
+    is_nominal: ClassVar[bool] = False
+    #: A level of the source that each reduction projects out: always fitted, and no fault.
+    is_projected: ClassVar[bool] = False
+    #: Holds where an instrument file names it, and is not looked for: an unknown sample would take it up.
+    from_file_only: ClassVar[bool] = False
+    #: Its values trade off along a bent valley: curvature at one point tells neither minimum nor error.
+    has_bent_valley: ClassVar[bool] = False
+    #: Part of what it explains (chi-square) that its simple form may leave over.
+    rough: ClassVar[float] = 0.0
+    #: The one look or capture that shows it, if there is one, in a sentence.
+    advice: ClassVar[str] = ""
+
+    def moves_image(self, place: str) -> bool:
+        """Whether it moves the image at this place, which is undone by moving the frames back."""
+        return False
+
+    def reaches_around(self, place: str) -> bool:
+        """Whether it mixes a pixel with those around it at this place: the image is moved, or blurred."""
+        return self.moves_image(place)
+
+    def acts_on_counts(self, place: str) -> bool:
+        """Whether it changes the counts at this place and not the rows of W: the image moves, the response bends."""
+        return False
+
+    def is_pointwise(self, place: str) -> bool:
+        """Whether it changes every count by itself at this place, so that `undo` gives the counts of the light."""
+        return False
+
+    def slips(self, place: str) -> tuple[str, int] | None:
+        """The axis that stands wrong at this place, and the state from which on; None if no axis does."""
+        return None
 
 
 E = TypeVar("E", bound=Effect)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from processing.effect import EffectError, Parameter, found_in
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import InstrumentEffect, ValuePerState
+from processing.instrument.effects.base import InstrumentEffect
 from processing.instrument.model import AppliedEffect, InstrumentModel
 from processing.instrument.nominal import KIND, shift_nominal
 
@@ -51,7 +51,7 @@ def apply_to(changes: Changes, model: InstrumentModel, applied: AppliedEffect) -
 
 
 def _values(applied: AppliedEffect, effect: InstrumentEffect, parameters: tuple[Parameter, ...]) -> NDArray[np.float64]:
-    if isinstance(effect, ValuePerState):
+    if effect.per_state:
         (entry,) = applied.parameters.values()
         values = np.asarray(entry.value, dtype=float).reshape(-1)
         if values.size != len(parameters):

@@ -12,7 +12,6 @@ from processing.effect import EffectError
 from processing.instrument.applied_effects import changes_of, instrument_effects
 from processing.instrument.changes import Conditions
 from processing.instrument.determined import LEAST, determined_basis
-from processing.instrument.effects.base import CountsEffect
 from processing.instrument.elements import Dispersive, number
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.instrument.nominal import KIND
@@ -74,7 +73,8 @@ def influences(
 
 
 def _change_by(model: InstrumentModel, effect: AppliedEffect, where: Conditions) -> float | None:
-    if effect not in model.effects or isinstance(instrument_effects().get(effect.kind), CountsEffect):
+    listed = instrument_effects().get(effect.kind)
+    if effect not in model.effects or (listed is not None and listed.acts_on_counts(effect.element or "")):
         return None
     here = effect.model_copy(update={"scope": "instrument"})
     others = tuple(e for e in model.effects if e != effect and e.scope == "instrument")

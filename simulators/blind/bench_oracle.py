@@ -20,7 +20,6 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import PRIOR_WIDTH, minimize
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import ValuePerState
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.storage.captures.capture import Capture
 from simulators.blind.bench_judge import GIVEN, active
@@ -74,7 +73,7 @@ def _as_drawn(candidate: Candidate) -> Candidate:
 
 def _applied(candidate: Candidate, values: Array, names: tuple[str, ...], wavelength_nm: float) -> AppliedEffect:
     unit = candidate.parameters[0].unit
-    if isinstance(candidate.effect, ValuePerState):
+    if candidate.effect.per_state:
         parameters = {"states": EffectParameter(value=tuple(map(float, values)), unit=unit)}
     else:
         pairs = zip(candidate.parameters, values, strict=True)

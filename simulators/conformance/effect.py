@@ -16,7 +16,6 @@ from processing.diagnosis.search.space import Space
 from processing.effect import Effect, Parameter
 from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import OfOneCapture, Switch
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
@@ -76,13 +75,13 @@ class EffectConformance:
         self, kind: str, case: tuple[InstrumentModel, CaptureData]
     ) -> None:
         effect, (model, capture) = instrument_effects()[kind], case
-        if isinstance(effect, Switch):
+        if effect.is_switch:
             # On or off: there is nothing to differentiate.
             return
         problem = InstrumentProblem(model, [capture])
         place = effect.places(model, capture.conditions)[-1]
         parameters = effect.parameters(model, capture.conditions, place)
-        space = Space((Candidate(effect, place, parameters, 0 if isinstance(effect, OfOneCapture) else None),))
+        space = Space((Candidate(effect, place, parameters, 0 if effect.of_one_capture else None),))
         at = 0.3 * space.joined("typical") * np.random.default_rng(2).uniform(0.5, 1, space.size)
         gradient = 2 * problem.sums(space, at).gradient.sum(axis=0)
         for j in np.unique([0, space.size - 1]):

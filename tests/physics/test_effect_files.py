@@ -18,7 +18,7 @@ from processing.diagnosis.search.candidate import pool
 from processing.effect import BASE, EffectError, found_in
 from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.changes import Conditions
-from processing.instrument.effects.base import FromFileOnly, InstrumentEffect
+from processing.instrument.effects.base import InstrumentEffect
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
 
@@ -122,7 +122,7 @@ def offered_by_all(configs: Path) -> set[str]:
 def test_without_one_file_the_others_are_offered(folder, name, hidden, configs):
     before = offered_by_all(configs)
     effect = {**instrument_effects(), **reflectance_effects()}[name]
-    assert name in before or isinstance(effect, FromFileOnly)
+    assert name in before or effect.from_file_only
     hidden(folder, name)
     # Two kinds are files of both folders.
     twin = (FOLDERS[folder == FOLDERS[0]], name) in FILES and folder == FOLDERS[0]

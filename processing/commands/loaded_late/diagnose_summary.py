@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import typer
@@ -12,6 +12,7 @@ from processing.diagnosis.search.result import (
     Combination,
     Diagnosis,
     FoundEffect,
+    Ranked,
     Unexplained,
 )
 from processing.whole_file import write_new_text
@@ -25,6 +26,8 @@ VERDICTS = {
 }
 #: What a diagnosis recommends where no capture would tell more.
 NOTHING_NEEDED = "None needed."
+#: [causes] That are told with what each would leave alone.
+MOST_NEAR = 3
 
 
 def write_result(path: Path, d: Diagnosis) -> None:
@@ -58,7 +61,7 @@ def show(d: Diagnosis, details: bool = False, written: bool = False) -> None:
         _show_effect(short, number, effect, noise)
     _show_uncertainty(d, written)
     if d.unexplained is not None:
-        _show_unexplained(short, d.unexplained)
+        _show_unexplained(short, d.unexplained, d.ranking)
     if details:
         _show_details(short, d)
     _say(short, f"next: {d.recommendation}" if d.recommendation != NOTHING_NEEDED else "no further capture is needed")
@@ -173,14 +176,12 @@ def _show_capture(short: Mapping[str, str], c: CaptureReport) -> None:
         typer.echo(f"closure{of}: {c.closure_before_percent:.3f} % -> {c.closure_after_percent:.3f} %")
 
 
-def _show_unexplained(short: Mapping[str, str], unexplained: Unexplained) -> None:
+def _show_unexplained(short: Mapping[str, str], unexplained: Unexplained, ranking: Sequence[Ranked]) -> None:
     _say(short, "unexplained structure is left:")
     for line in unexplained.description:
         _say(short, f"   {line}")
-    if unexplained.empirical is not None:
-        e = unexplained.empirical
-        typer.echo(f"   empirical {e.kind} would leave {e.rms_percent_in_sample:.4f} % (in sample, names no cause)")
-        typer.echo(f"   would also fit: {', '.join(e.would_also_fit)}")
+    for one in ranking[:MOST_NEAR]:
+        typer.echo(f"   {one.candidate} alone would leave {one.rms_percent:.4f} %, and is no explanation")
 
 
 def _combination(c: Combination) -> str:

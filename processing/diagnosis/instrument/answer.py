@@ -15,7 +15,7 @@ from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES, feat
 from processing.diagnosis.instrument.mueller_error import MuellerErrors, UncertainMueller
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import Residual
-from processing.diagnosis.search.candidate import Candidate, SourceLevel
+from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Answer, Cause, information, shown
 from processing.diagnosis.search.decision import Judgement
 from processing.diagnosis.search.fit import Fit, HeldOut, Solution
@@ -25,7 +25,6 @@ from processing.diagnosis.search.result import (
     CaptureReport,
     Combination,
     Correction,
-    Empirical,
     Error,
     FoundEffect,
     MuellerError,
@@ -34,11 +33,8 @@ from processing.diagnosis.search.result import (
     Ranked,
 )
 from processing.diagnosis.search.rules import (
-    ALSO,
-    ALSO_FITS,
     DECISIVE,
     DOUBTED,
-    EMPIRICAL_SHARE,
     FAR_OFF,
     LIKELY,
     MOST_RANKED,
@@ -46,20 +42,11 @@ from processing.diagnosis.search.rules import (
     SEEN,
     SMALL,
     SURE,
-    TAU,
     TOGETHER,
 )
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
 from processing.instrument.changes import places
-from processing.instrument.effects.base import (
-    CountsEffect,
-    FieldEffect,
-    GeneralEffect,
-    InstrumentEffect,
-    Switch,
-    ValuePerState,
-)
 from processing.instrument.model import AppliedEffect, EffectParameter
 
 
@@ -126,7 +113,7 @@ def combinations(found: Posterior, solved: Solution) -> tuple[Combination, ...]:
     names: list[str] = []
     units: list[str] = []
     for candidate, part in found.space.pairs:
-        if candidate in effects and not isinstance(candidate.effect, ValuePerState):
+        if candidate in effects and not candidate.effect.per_state:
             at += range(part.start, part.stop)
             single = candidate.size == 1
             names += [candidate.label if single else f"{candidate.label} {p.name}" for p in candidate.parameters]
@@ -145,42 +132,6 @@ def combinations(found: Posterior, solved: Solution) -> tuple[Combination, ...]:
             )
         )
     return tuple(told)
-
-
-def empirical(found: Posterior, solved: Solution) -> Empirical | None:
-    """The best of: a gain for each state, an angle for each state, a bend of the response; last linearization."""
-    part = dict(found.space.pairs)
-    plain = [c for c in solved.space.candidates if not isinstance(c.effect, GeneralEffect)]
-    beside = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[part[c]] for c in plain)]).astype(np.int64)
-    before, _ = _excess_of(found, beside)
-    fits: list[tuple[float, Candidate, Array]] = []
-    for candidate, mine in part.items():
-        if isinstance(candidate.effect, GeneralEffect):
-            left, x = _excess_of(found, np.concatenate([beside, np.r_[mine]]))
-            fits.append((left, candidate, x[beside.size :] * candidate.typical))
-    if not fits:
-        return None
-    left, best, values = min(fits, key=lambda f: f[0])
-    if left > (1 - EMPIRICAL_SHARE) * before or not isinstance(best.effect, GeneralEffect):
-        return None
-    freedom = found.sets.noise.slack + ALSO * (before - left)
-    total = max(solved.before.excess + solved.before.freedom, 1e-300)
-    share = max(left + (solved.before.freedom if found.sets.noise.known else 0.0), 0.0) / total
-    return Empirical(
-        kind=best.effect.describes,
-        rms_percent_in_sample=100 * solved.before.rms * float(np.sqrt(share)),
-        values=tuple(values.tolist()),
-        unit=best.parameters[0].unit,
-        would_also_fit=tuple(dict.fromkeys(c.short for e, c, _ in fits if e <= left + ALSO_FITS * freedom)),
-    )
-
-
-def _excess_of(found: Posterior, index: NDArray[np.int64]) -> tuple[float, Array]:
-    """Excess that some values leave, each held by the widest prior, and the values in typical sizes."""
-    form = found.sets.form
-    g, h = form.gradient[index], form.curvature[np.ix_(index, index)]
-    x = -np.linalg.solve(h + np.eye(index.size) * found.samples.best.unit / TAU[-1] ** 2, g)
-    return float(form.excess + 2 * g @ x + x @ h @ x), x
 
 
 def error(problem: InstrumentProblem, solved: Solution, out: HeldOut, k: int | None = None) -> Error:
@@ -282,7 +233,7 @@ def told_switches(problem: InstrumentProblem, solved: Solution) -> list[FoundEff
     """Pixels that are left out because what they say is another thing than the others say."""
     told = []
     for candidate, part in solved.space.pairs:
-        if not isinstance(candidate.effect, Switch):
+        if not candidate.effect.is_switch:
             continue
         without = left_without(problem, solved, (candidate,))
         gain = without.excess - solved.after.excess
@@ -361,9 +312,8 @@ def _mueller_error(uncertain: UncertainMueller) -> MuellerError:
 def _wavelength(problem: InstrumentProblem, candidate: Candidate) -> float | None:
     """Wavelength at which the values hold; None for all of them."""
     several = sorted(set(problem.wavelengths_nm))
-    effect = candidate.effect
-    declared = problem.model.belongs_to.get(candidate.kind)
-    if isinstance(effect, InstrumentEffect) and (declared or effect.belongs_to) == "mechanics":
+    effect = candidate.of_instrument
+    if effect and problem.model.belongs_to.get(candidate.kind, effect.belongs_to) == "mechanics":
         return None
     if candidate.capture is not None:
         return problem.wavelengths_nm[candidate.capture]
@@ -418,7 +368,7 @@ def unobservable(problem: InstrumentProblem, found: Posterior) -> list[Candidate
     told, always = information(found)
     out = []
     for candidate, part in found.space.pairs:
-        if candidate.state_chosen or isinstance(candidate.effect, Switch) or np.isin(part.start, always):
+        if candidate.state_chosen or candidate.effect.is_switch or np.isin(part.start, always):
             continue
         least = np.full(candidate.size, SEEN)
         if candidate.reaches_around:
@@ -433,7 +383,7 @@ def unobservable(problem: InstrumentProblem, found: Posterior) -> list[Candidate
 
 def missing(unseen: list[Candidate]) -> list[Candidate]:
     """Of what is unobservable, what another sample could show."""
-    return [c for c in unseen if not isinstance(c.effect, CountsEffect | FieldEffect)]
+    return [c for c in unseen if not (c.acts_on_counts or c.effect.varies_over_image)]
 
 
 def capture_report(
@@ -468,7 +418,7 @@ def _source_percent(problem: InstrumentProblem, k: int, solved: Solution) -> flo
     if not problem.has_free_level(k):
         return None
     found = dict(solved.space.pairs)
-    own = [p for c, p in found.items() if isinstance(c.effect, SourceLevel) and c.capture == k]
+    own = [p for c, p in found.items() if c.effect.is_projected and c.capture == k]
     level = 1 + solved.fit.values[own[0]] if own else None
     if level is None:
         data, mine = problem.captures[k], solved.space.acting(k, problem.wavelengths_nm[k])

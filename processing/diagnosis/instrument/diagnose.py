@@ -17,7 +17,6 @@ from processing.diagnosis.instrument.answer import (
     calibrated,
     capture_report,
     correction,
-    empirical,
     error,
     floor,
     missing,
@@ -46,7 +45,6 @@ from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, FoundEffect, Unexplained
 from processing.diagnosis.search.rules import GROWTH, LIKELY, MOST_TRIED, OUTSTANDING
-from processing.instrument.effects.base import ValuePerState
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture, CaptureError
 
@@ -155,11 +153,7 @@ def names_of(outcome: Outcome) -> Names:
     """Names of the causes of a posterior, as far as what is left over allows them."""
     asked, found, solved = outcome.asked, outcome.found, outcome.solved
     likely = tuple(c for c in causes(found, outcome.left) if c.probability >= LIKELY)
-    untold = tuple(
-        c
-        for c in likely
-        if isinstance(c.candidates[0].effect, ValuePerState) and not testable(asked, solved, c, likely)
-    )
+    untold = tuple(c for c in likely if c.candidates[0].effect.per_state and not testable(asked, solved, c, likely))
     named = tuple(c for c in likely if c not in untold)
     # What as many values as the data have took away may be any structure.
     left = outcome.left + sum(2 * c.log_odds * found.samples.best.unit for c in untold)
@@ -278,7 +272,6 @@ def _unexplained(used: Outcome, names: Names) -> Unexplained:
     return Unexplained(
         description=descriptions([c.name for c in used.asked.captures], used.after),
         tried=tried or tuple(r.candidate for r in ranking(used.found, used.solved.before)[:MOST_TRIED]),
-        empirical=empirical(used.found, used.solved),
     )
 
 

@@ -24,13 +24,6 @@ from processing.diagnosis.search.rules import (
     TIMES,
     UNEVEN_SHARE,
 )
-from processing.instrument.effects.base import (
-    FieldEffect,
-    GeneralEffect,
-    PointwiseEffect,
-    SourceEffect,
-    ValuePerState,
-)
 
 #: The image does not move where that would be seen best.
 STANDS = "the edges, which were left out of the fit, do not move as it says"
@@ -70,7 +63,7 @@ def doubts(
         if problem.noise_known:
             weak = 2 * cause.log_odds * found.samples.best.unit < TIMES * rank**2 * left
         else:
-            general = isinstance(cause.candidates[0].effect, GeneralEffect | PointwiseEffect)
+            general = cause.candidates[0].effect.per_state or cause.candidates[0].is_pointwise
             rest = found.sets.noise.directions if general else 0.0
             weak = cause.log_odds < max(CERTAIN, TIMES * rest / 2)
         if cause not in out and weak:
@@ -103,11 +96,11 @@ def _of_itself(
     effect = cause.candidates[0].effect
     if _at_bound(cause):
         return "a value stands at its bound: the data ask for something else"
-    if isinstance(effect, ValuePerState):
+    if effect.per_state:
         if not testable(problem, solved, cause, causes):
             return "as many values as the data have"
         return None
-    if isinstance(effect, SourceEffect):
+    if effect.of_source:
         return OF_THE_SAMPLE if any(_uneven(even, solved, c, cause) for c in cause.candidates) else None
     # Channels that look at places apart leave something where the image is curved: that is not alike either.
     alike = any(c.place_px is not None for c in problem.captures)
@@ -141,13 +134,13 @@ def testable(problem: InstrumentProblem, solved: Solution, cause: Cause, causes:
     for k, ((free, power), nm) in enumerate(zip(problem.powers(), problem.wavelengths_nm, strict=True)):
         seen = excess * power / power.sum()
         directions.append(free * max(1.0, float(np.sum(seen / (1 + seen)))) if problem.noise_known else free)
-        values.append(sum(c.size for c in before if isinstance(c.effect, ValuePerState) and c.acts(k, nm)))
+        values.append(sum(c.size for c in before if c.effect.per_state and c.acts(k, nm)))
         shows.append(
             any(size >= least and c.acts(k, nm) for size, c in zip(sizes, cause.candidates, strict=True)),
         )
     others = len(causes) - 1
     # What the captures share counts once.
-    all_values = sum(c.size for c in before if isinstance(c.effect, ValuePerState))
+    all_values = sum(c.size for c in before if c.effect.per_state)
     return bool(
         all_values + others < TESTABLE * sum(directions)
         or np.any((np.array(values) + others < TESTABLE * np.array(directions)) & shows)
@@ -164,7 +157,7 @@ def _at_bound(cause: Cause) -> bool:
 
 def _uneven(even: Evenness, solved: Solution, candidate: Candidate, cause: Cause) -> bool:
     """A source, a train or a detector that changes does so alike in the whole image."""
-    if candidate not in solved.space.candidates or any(isinstance(c.effect, FieldEffect) for c in solved.effects):
+    if candidate not in solved.space.candidates or any(c.effect.varies_over_image for c in solved.effects):
         return False
     excess, terms = even.varies(candidate)
     return bool(excess > max(OUTSTANDING * np.sqrt(2 * terms), UNEVEN_SHARE * 2 * cause.log_odds))

@@ -16,12 +16,11 @@ import numpy as np
 
 from processing.arrays import Array, BoolArray
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.search.candidate import Candidate, NominalValue
+from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.posterior import Say
 from processing.diagnosis.search.rules import FAR_DEG, FAR_OFF, MOSTLY, NEAR_DEG, NEAR_ENOUGH, STARTS
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import ChannelLevels, SourceEffect, ValuePerState
 from processing.instrument.elements import number
 
 #: [of the residual] By which two branches may differ that are the same to the data.
@@ -85,7 +84,7 @@ def _of_nominal_retardance(problem: InstrumentProblem, found: Mapping[Candidate,
     azimuths = {c.place.rpartition(".")[0]: c for c in values if _is_azimuth(c)}
     for candidate, value in found.items():
         element, _, field = candidate.place.rpartition(".")
-        if field != "retardance_deg" or candidate.curve is not None or not isinstance(candidate.effect, NominalValue):
+        if field != "retardance_deg" or candidate.curve is not None or not candidate.effect.is_nominal:
             continue
         nominal = number(problem.model.value_of(candidate.place) or 0.0)
         same, opposite = (_near_zero(sign * (nominal + value[0]) - nominal) for sign in (1, -1))
@@ -105,7 +104,7 @@ def _near_zero(retardance_deg: float) -> float:
 
 
 def _is_azimuth(candidate: Candidate) -> bool:
-    return isinstance(candidate.effect, NominalValue) and candidate.effect.field == "azimuth_deg"
+    return candidate.effect.is_nominal and candidate.place.endswith(".azimuth_deg")
 
 
 def _mean(candidate: Candidate, values: Array) -> float:
@@ -162,7 +161,7 @@ def first_values(problem: InstrumentProblem, base: Space, pool: Sequence[Candida
     if fit.rms < (NEAR_ENOUGH if several else FAR_OFF):
         return base.split(fit.values)
     say("far off: searching from many starts")
-    if not any(isinstance(c.effect, NominalValue) for c in base.candidates):
+    if not any(c.effect.is_nominal for c in base.candidates):
         return _far(problem, pool, base, fit)
     if not several:
         return _searched(problem, base, pool, fit)
@@ -174,12 +173,7 @@ def first_values(problem: InstrumentProblem, base: Space, pool: Sequence[Candida
 
 def _searched(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate], fit: Fit) -> Values:
     # Nominal values are not found beside a source or channels that are as far off.
-    free = [
-        c
-        for c in pool
-        if isinstance(c.effect, ChannelLevels)
-        or (isinstance(c.effect, SourceEffect) and isinstance(c.effect, ValuePerState))
-    ]
+    free = [c for c in pool if c.effect.of_channels or (c.effect.of_source and c.effect.per_state)]
     wide = Space((*base.candidates, *free))
     values = np.concatenate([fit.values, np.zeros(wide.size - base.size)])
     return wide.split(_best_start(problem, wide, values, fit.excess, starts=STARTS))
@@ -235,7 +229,7 @@ def _widths(space: Space, retardance: float) -> Array:
 
 def _anywhere(candidate: Candidate) -> bool:
     """A nominal value that may be far off: no window, no diattenuation."""
-    return isinstance(candidate.effect, NominalValue) and candidate.parameters[0].typical >= NEAR_DEG
+    return candidate.effect.is_nominal and candidate.parameters[0].typical >= NEAR_DEG
 
 
 def _far(problem: InstrumentProblem, pool: Sequence[Candidate], base: Space, fit: Fit) -> Values:
@@ -252,7 +246,7 @@ def _far(problem: InstrumentProblem, pool: Sequence[Candidate], base: Space, fit
 def along_wavelengths(problem: InstrumentProblem, base: Space, say: Say) -> Values:
     """One wavelength from many starts, the others one after the other as their neighbours point, then all together."""
     wavelengths = sorted(set(problem.wavelengths_nm))
-    space = Space((*base.candidates, *(c for c in problem.pool() if isinstance(c.effect, ChannelLevels))))
+    space = Space((*base.candidates, *(c for c in problem.pool() if c.effect.of_channels)))
     each = [_AtOne(problem.at(w), space, w) for w in wavelengths]
     best: Fit | None = None
     for first in (len(wavelengths) // 2, 0, len(wavelengths) - 1):
@@ -280,7 +274,7 @@ class _AtOne:
         self.space = space.acting(0, wavelength_nm).space
 
         candidates = self.space.candidates
-        large = (_anywhere(c) or not isinstance(c.effect, NominalValue) for c in candidates for _ in c.parameters)
+        large = (_anywhere(c) or not c.effect.is_nominal for c in candidates for _ in c.parameters)
         self._large = np.array(list(large))
 
     def searched(self) -> Values:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.search.candidate import Candidate, SourceLevel
+from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.decision import PredictedChange, predicted_change
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
@@ -24,7 +24,6 @@ from processing.diagnosis.search.rules import MOST_STORED, SMALL_PART, STORED_SH
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
 from processing.instrument.changes import Changes
-from processing.instrument.effects.base import FieldEffect, Switch
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
 
 #: [elements, fixed] Of M/m00 that can be wrong.
@@ -221,7 +220,7 @@ def _moves_mueller(found: Posterior, k: int, applied: bool) -> bool:
     """Whether a candidate may make M wrong by values that do not differ over the image."""
     candidate = found.space.candidates[k]
     # Levels of a source are projected out by each reduction, which carries their errors itself.
-    if isinstance(candidate.effect, FieldEffect | Switch | SourceLevel):
+    if candidate.effect.varies_over_image or candidate.effect.is_switch or candidate.effect.is_projected:
         return False
     spread = np.diag(found.covariance)[found.space.slices[k]]
     if applied or not candidate.state_chosen:

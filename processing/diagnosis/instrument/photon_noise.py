@@ -17,7 +17,6 @@ from processing.diagnosis.instrument.features import MARGIN
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.rules import DARK_NOISE_OFF, GAIN_OFF, NOISE_OFF, SHOWN
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import InstrumentEffect, PointwiseEffect
 
 
 def movable(shift_px: Array) -> bool:
@@ -36,9 +35,7 @@ def distance(undone: Mapping[Candidate, Array], space: Space, values: Array, *, 
 
 def _exactly_undone(candidate: Candidate, pointwise: bool) -> bool:
     """Whether a correction has to be undone exactly, as far off a line; with `pointwise`, to know the light."""
-    return (
-        candidate.is_pointwise if pointwise else isinstance(candidate.effect, PointwiseEffect) or candidate.moves_image
-    )
+    return candidate.is_pointwise or (candidate.moves_image and not pointwise)
 
 
 def exactly_undone(space: Space, values: Array, *, pointwise: bool = False) -> dict[Candidate, Array]:
@@ -53,8 +50,8 @@ def undoing(data: CaptureData, undone: Mapping[Candidate, Array]) -> Correct:
     def correct(signal: Array) -> tuple[Array, Array]:
         slope = np.ones(())
         for candidate, values in undone.items():
-            if isinstance(candidate.effect, InstrumentEffect) and candidate.is_pointwise:
-                signal, step = candidate.effect.undo(signal, data.conditions, candidate.place, values)
+            if candidate.of_instrument and candidate.is_pointwise:
+                signal, step = candidate.of_instrument.undo(signal, data.conditions, candidate.place, values)
                 slope = slope * step
         return signal, slope
 

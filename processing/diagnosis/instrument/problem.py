@@ -34,13 +34,6 @@ from processing.diagnosis.search.rules import ENOUGH_SOUND, EXACT
 from processing.diagnosis.search.space import Space, Sums
 from processing.instrument.applied_effects import apply_to, changes_of
 from processing.instrument.changes import Changes
-from processing.instrument.effects.base import (
-    FieldEffect,
-    LevelEffect,
-    PointwiseEffect,
-    SourceEffect,
-    ValuePerState,
-)
 from processing.instrument.model import InstrumentModel
 
 #: [points] Of expansion that are kept besides the first: each has counts of its own.
@@ -114,7 +107,7 @@ class InstrumentProblem:
         def is_taken_up(level: Candidate) -> bool:
             return all(self.has_free_level(k) for k, nm in enumerate(self.wavelengths_nm) if level.acts(k, nm))
 
-        return tuple(c for c in found if not (isinstance(c.effect, LevelEffect) and is_taken_up(c)))
+        return tuple(c for c in found if not (c.effect.is_level and is_taken_up(c)))
 
     def powers(self) -> list[tuple[int, Array]]:
         """Rows that the unknowns leave over, and the power of each component of the signal, for each capture."""
@@ -152,7 +145,7 @@ class InstrumentProblem:
         if distance(known.undone, space, values) < EXACT:
             return False
         undone = exactly_undone(space, values)
-        bent = {c: v for c, v in undone.items() if isinstance(c.effect, PointwiseEffect)}
+        bent = {c: v for c, v in undone.items() if c.is_pointwise}
         shifts = [own + self._shift_px(k, undone) for k, own in enumerate(self.own_px)]
         if not all(movable(s) for s in shifts):
             return False
@@ -355,8 +348,8 @@ class InstrumentProblem:
         parts = dict(space.pairs)
         for k, (data, nm) in enumerate(zip(self.captures, self.wavelengths_nm, strict=True)):
             conditions = data.conditions
-            acting = [c for c in parts if isinstance(c.effect, SourceEffect) and c.acts(k, nm)]
-            levels = [c for c in acting if isinstance(c.effect, ValuePerState)]
+            acting = [c for c in parts if c.effect.of_source and c.acts(k, nm)]
+            levels = [c for c in acting if c.effect.per_state]
             if conditions.elapsed_error == 0 or not levels:
                 continue
             gains = []
@@ -371,7 +364,7 @@ class InstrumentProblem:
         return out
 
     def _has_field(self, space: Space) -> bool:
-        return any(isinstance(c.effect, FieldEffect) for c in space.candidates)
+        return any(c.effect.varies_over_image for c in space.candidates)
 
     def _block_sums(
         self, k: int, space: Space, values: Array, changes: Changes, *, out: Sums, derivatives: bool

@@ -14,7 +14,6 @@ from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.range_of import part_outside
 from processing.diagnosis.search.rules import APART, CLEARLY_MORE, VISIBLE
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import CountsEffect, InstrumentEffect, ValuePerState
 from processing.polarization import mueller
 
 #: [typical sizes] Step of a difference of signals.
@@ -45,7 +44,7 @@ def _capture(
     problem: InstrumentProblem, space: Space, fit: Fit, rivals: Sequence[Candidate], *, unseen: Sequence[Candidate]
 ) -> str:
     """One sentence: the capture that separates the rivals, or shows the unseen, or that none of the usual does."""
-    rows_side = [c for c in rivals if not isinstance(c.effect, CountsEffect) and isinstance(c.effect, InstrumentEffect)]
+    rows_side = [c for c in rivals if not c.acts_on_counts]
     have = [c.sample for c in problem.captures]
     best, power = "", 0.0
     for name, sample in SAMPLES.items():
@@ -55,14 +54,14 @@ def _capture(
         # A simpler sample is preferred unless another one tells clearly more.
         if value > power + CLEARLY_MORE:
             best, power = name, value
-    if any(isinstance(c.effect, CountsEffect) for c in rivals):
+    if any(c.acts_on_counts for c in rivals):
         return (
             "A series of exposure times on an unpolarized, evenly lit target tells detector effects from optics; "
             "dark frames tell an offset."
         )
     if best and power >= APART:
         return f"Capture {best} with the same states."
-    if any(isinstance(c.effect, ValuePerState) for c in rivals):
+    if any(c.effect.per_state for c in rivals):
         return "Repeat the capture: what comes back is the mechanics, what does not is the source; or record a monitor."
     if rivals:
         return (

@@ -10,14 +10,7 @@ from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import (
-    CountsEffect,
-    FromAState,
-    InstrumentEffect,
-    Switch,
-    ValuePerState,
-    turned_by,
-)
+from processing.instrument.effects.base import turned_by
 from processing.instrument.model import InstrumentModel
 
 #: Makes A (..., L, K) of the changes of a capture.
@@ -37,19 +30,19 @@ def slopes_of_rows(
     values: Array,
     a: Array,
     columns: Columns,
-    leave_out: tuple[type[InstrumentEffect], ...] = (CountsEffect,),
+    varying: bool = True,
 ) -> Array:
     """Derivatives (values, ..., L, K) of a (..., L, K), which `columns` makes of the changes.
 
-    Zero by the values of effects that are left out.
+    Zero by the values of effects that act on counts alone; also of those that vary over the image, if not `varying`.
     """
     da = np.zeros((space.size, *a.shape))
     channels = len(conditions.channels)
     whole: dict[str, Array] = {}
     for candidate, part in fitted(space):
-        if isinstance(candidate.effect, leave_out):
+        if candidate.acts_on_counts or (candidate.effect.varies_over_image and not varying):
             continue
-        if isinstance(candidate.effect, ValuePerState):
+        if candidate.effect.per_state:
             # Parameter n acts on state n alone: one step of all of them together gives every derivative.
             moved = values.copy()
             step = STEP * candidate.typical
@@ -59,10 +52,10 @@ def slopes_of_rows(
                 rows = slice(n * channels, (n + 1) * channels)
                 da[part.start + n, ..., rows, :] = slope[..., rows, :]
             continue
-        if isinstance(candidate.effect, FromAState) and not values[part].any():
+        slips = candidate.effect.slips(candidate.place)
+        if slips is not None and not values[part].any():
             # The same step of the same axis from another state on: one evaluation serves all of them.
-            axis = candidate.effect.axis(candidate.place)
-            first = candidate.effect.first_state(candidate.place)
+            axis, first = slips
             if axis not in whole:
                 turned = changes_of(values)
                 turned.turn_axis(axis, np.full(conditions.states, STEP), turned_by(model, axis))
@@ -80,7 +73,7 @@ def slopes_of_counts(
     """Derivatives (values, F, L) of the coefficients c (F, L) of the corrected counts."""
     dc = np.zeros((space.size, *c.shape))
     for candidate, part in fitted(space):
-        if isinstance(candidate.effect, InstrumentEffect) and candidate.effect.acts_on_counts(candidate.place):
+        if candidate.acts_on_counts:
             for j, (moved, step) in enumerate(stepped(candidate, part, values)):
                 dc[part.start + j] = (coefficients(changes_of(moved)) - c) / step
     return dc
@@ -89,7 +82,7 @@ def slopes_of_counts(
 def fitted(space: Space) -> list[tuple[Candidate, slice]]:
     """Candidates that have values to fit."""
     pairs = space.pairs
-    return [(c, part) for c, part in pairs if not isinstance(c.effect, Switch)]
+    return [(c, part) for c, part in pairs if not c.effect.is_switch]
 
 
 def stepped(candidate: Candidate, part: slice, values: Array) -> Iterator[tuple[Array, float]]:

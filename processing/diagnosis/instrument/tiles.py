@@ -27,7 +27,6 @@ from processing.diagnosis.instrument.projection import Projected, add_parts
 from processing.diagnosis.instrument.slopes import ChangesOf, fitted, slopes_of_rows, stepped
 from processing.diagnosis.search.space import Space, Sums
 from processing.instrument.changes import Changes
-from processing.instrument.effects.base import CountsEffect, FieldEffect
 from processing.instrument.model import InstrumentModel
 from processing.reduction.effects_of_capture import extra_retardance, with_extra
 
@@ -194,14 +193,13 @@ def slopes_of_tiles(
         raise ValueError("a capture that holds out states has no tiles")
     changes, conditions = changes_of(values), data.conditions
     columns = partial(columns_at_nodes, model, data, moments)
-    apart = CountsEffect, FieldEffect
     at_nodes = slopes_of_rows(
-        changes_of, model, conditions, space, values=values, a=columns(changes), columns=columns, leave_out=apart
+        changes_of, model, conditions, space, values=values, a=columns(changes), columns=columns, varying=False
     )
     fields = {
         part.start + j: (tile_columns(model, data, moments, changes_of(moved)) - a) / step
         for candidate, part in fitted(space)
-        if isinstance(candidate.effect, FieldEffect)
+        if candidate.effect.varies_over_image
         for j, (moved, step) in enumerate(stepped(candidate, part, values))
     }
     counted = np.flatnonzero(np.any(dc, axis=(1, 2)))

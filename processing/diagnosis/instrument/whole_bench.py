@@ -31,13 +31,6 @@ from processing.diagnosis.search.rules import (
     TAKES_PART,
 )
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import (
-    FieldEffect,
-    PointwiseEffect,
-    SourceEffect,
-    Switch,
-    ValuePerState,
-)
 from processing.instrument.elements import number
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import CaptureError
@@ -122,7 +115,7 @@ class WholeBench:
             plain = [c for c in plain if c not in too_many]
             found = self._posterior([*fixed, *plain], fixed)
         found = self._with_what_scatters_so(found, fixed)
-        fields = [c for c in self.pool if isinstance(c.effect, FieldEffect)]
+        fields = [c for c in self.pool if c.effect.varies_over_image]
         if fields and not self.whole.holds_out_states:
             # What the noise seemed to speak against may be right beside what varies over the image.
             beside = self._with_fields(found, fixed, plain, fields)
@@ -221,7 +214,7 @@ class WholeBench:
 
     def _offered(self, candidate: Candidate) -> bool:
         effect = candidate.effect
-        if isinstance(effect, FieldEffect | Switch):
+        if effect.varies_over_image or effect.is_switch:
             return False
         if candidate.price and (
             not self.whole.noise_known or self.whole.holds_out_states or len(set(self.whole.wavelengths_nm)) > 1
@@ -232,12 +225,12 @@ class WholeBench:
         mine = [captures[k] for k in acting]
         if candidate.reaches_around:
             return all(min(c.signal.shape[2:]) > 2 * MARGIN + 2 for c in mine)
-        if isinstance(effect, PointwiseEffect):
+        if candidate.is_pointwise:
             # With one number a pixel to test, a bend of the response and gains of the channels explain each other. So
             # do, with one ratio a state, a bend and what leaks through the channels, unless the noise tells the light.
             one_ratio = all(self.whole.ratios(k) == 1 for k in acting)
             return any(free > 1 for free in self._free) and (self.whole.noise_known or not one_ratio)
-        if isinstance(effect, ValuePerState) and not self.whole.noise_known:
+        if effect.per_state and not self.whole.noise_known:
             # A value for each intensity would be noise by another name.
             return len(self.whole.model.channels) > 1
         return True
@@ -253,10 +246,10 @@ class WholeBench:
             for g, p in enumerate(found.samples.probability)
             if p > least
             for m in found.members[g]
-            if isinstance(found.space.candidates[m].effect, ValuePerState)
+            if found.space.candidates[m].effect.per_state
         ]
         kept: list[Candidate] = []
-        for candidate in sorted(per_state, key=lambda c: not isinstance(c.effect, SourceEffect)):
+        for candidate in sorted(per_state, key=lambda c: not c.effect.of_source):
             if all(self._has_room(where, [*kept, candidate]) for where in map(self._seen_by, [*kept, candidate])):
                 kept.append(candidate)
         return set(per_state) - set(kept)
@@ -291,7 +284,7 @@ class WholeBench:
     def _clipped(self) -> list[Candidate]:
         """The switch that leaves clipped pixels out, if they say something else than the others."""
         for candidate in self.pool:
-            if isinstance(candidate.effect, Switch) and any(c.clipped.any() for c in self.whole.captures):
+            if candidate.effect.is_switch and any(c.clipped.any() for c in self.whole.captures):
                 self._start[candidate] = np.ones(1)
                 return [candidate]
         return []

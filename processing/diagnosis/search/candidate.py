@@ -15,7 +15,7 @@ from processing.effect import Effect, Parameter
 from processing.errors import ProcessError
 from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import FromAState, FromFileOnly, InstrumentEffect, SourceEffect, ValuePerState
+from processing.instrument.effects.base import InstrumentEffect, SourceEffect, ValuePerState
 from processing.instrument.model import Belongs, InstrumentModel
 from processing.instrument.nominal import FIELDS, KIND, shift_nominal
 
@@ -54,31 +54,41 @@ class Candidate:
     @property
     def state_chosen(self) -> bool:
         """The state that it starts at is chosen among many."""
-        return isinstance(self.effect, FromAState)
+        return self.effect.slips(self.place) is not None
 
     @property
     def moves_image(self) -> bool:
         """Whether it moves the image, and is undone by moving the frames back."""
-        return isinstance(self.effect, InstrumentEffect) and self.effect.moves_image(self.place)
+        return self.effect.moves_image(self.place)
 
     @property
     def reaches_around(self) -> bool:
         """Whether it mixes a pixel with those around it."""
-        return isinstance(self.effect, InstrumentEffect) and self.effect.reaches_around(self.place)
+        return self.effect.reaches_around(self.place)
 
     @property
     def is_pointwise(self) -> bool:
         """Whether it changes every count by itself."""
-        return isinstance(self.effect, InstrumentEffect) and self.effect.is_pointwise(self.place)
+        return self.effect.is_pointwise(self.place)
+
+    @property
+    def acts_on_counts(self) -> bool:
+        """Whether it changes the counts and not the rows of W."""
+        return self.effect.acts_on_counts(self.place)
+
+    @property
+    def of_instrument(self) -> InstrumentEffect | None:
+        """The effect, if it is one of an instrument and not of a reflectance."""
+        return self.effect if isinstance(self.effect, InstrumentEffect) else None
 
     def shifts(self, model: InstrumentModel) -> tuple[str, ...]:
         """Values of the train that it shifts and does nothing else."""
-        return self.effect.shifts(model, self.place) if isinstance(self.effect, InstrumentEffect) else ()
+        return self.of_instrument.shifts(model, self.place) if self.of_instrument else ()
 
     @property
     def family(self) -> str:
         """Name without the state that a slip starts at."""
-        where = self.effect.axis(self.place) if isinstance(self.effect, FromAState) else self.place
+        where, _ = self.effect.slips(self.place) or (self.place, 0)
         return f"{self.kind}:{where}:{self.capture}"
 
     def at(self, wavelength_nm: float) -> Candidate:
@@ -104,11 +114,11 @@ class Candidate:
 
     def apply(self, changes: Changes, model: InstrumentModel, values: Array) -> None:
         """Add the effect of these values to the changes of an instrument, if it is one of an instrument."""
-        if isinstance(self.effect, InstrumentEffect):
+        if self.of_instrument:
             if self.curve is not None:
                 (wavelength,) = model.wavelengths_nm or ()
                 values = self.matrix(wavelength) @ values
-            self.effect.apply(changes, model, self.place, values)
+            self.of_instrument.apply(changes, model, self.place, values)
 
     @property
     def typical(self) -> Array:
@@ -157,6 +167,8 @@ def _nominal(field: str, window: bool) -> Parameter:
 class NominalValue(InstrumentEffect):
     """A value of the train that the instrument file gives as only nominal (`calibrate`)."""
 
+    is_nominal = True
+
     #: A mount is the same at every wavelength; retardances and diattenuations follow a curve.
     BELONGS: ClassVar[dict[str, Belongs]] = {
         "azimuth_deg": "mechanics",
@@ -190,7 +202,7 @@ class SourceLevel(SourceEffect, ValuePerState):
     """The level of a source that several channels see, in each state of a capture: always there, and no fault."""
 
     kind = "source_level"
-    describes = "gain_per_state"
+    is_projected = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if conditions.states > 1 else ()
@@ -230,7 +242,7 @@ def pool(
     one_scale = len({c.full_scale for c in conditions}) == 1
     _check_declared(model)
     for effect in instrument_effects().values():
-        if isinstance(effect, FromFileOnly):
+        if effect.from_file_only:
             continue
         belongs = model.belongs_to.get(effect.kind, effect.belongs_to)
         if belongs == "detector" and not one_scale and effect.kind not in model.belongs_to:

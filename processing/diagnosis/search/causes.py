@@ -18,7 +18,6 @@ from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import ALIKE, LIKELY, NOMINAL_TAU, OUTSTANDING, SHOWN, SURE
 from processing.diagnosis.search.sets import probability_at
 from processing.diagnosis.search.space import Problem
-from processing.instrument.effects.base import CountsEffect, FieldEffect, Switch, ValuePerState
 
 Answer = Literal["sure", "likely", "one of", "unlisted", "unknown"]
 
@@ -128,8 +127,8 @@ def would_be_seen(found: Posterior) -> tuple[Candidate, ...]:
     return tuple(
         candidate
         for candidate, part in found.space.pairs
-        if not candidate.state_chosen
-        and not isinstance(candidate.effect, CountsEffect | FieldEffect | Switch | ValuePerState)
+        if not (candidate.state_chosen or candidate.acts_on_counts)
+        and not (candidate.effect.varies_over_image or candidate.effect.is_switch or candidate.effect.per_state)
         and not np.isin(part.start, always)
         and told[part].max() > OUTSTANDING**2
     )

@@ -12,7 +12,6 @@ from processing.arrays import Array, BoolArray
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.rules import LEAST_FREEDOM
 from processing.diagnosis.search.space import Problem, Space, Sums
-from processing.instrument.effects.base import ValuePerState
 
 #: [typical sizes] Width of the prior that keeps unseen parameters still.
 PRIOR_WIDTH = 10.0
@@ -213,7 +212,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
     by_state = problem.holds_out_states
     local = np.zeros(space.size, dtype=bool)
     for candidate, part in space.pairs:
-        local[part] = isinstance(candidate.effect, ValuePerState) and by_state
+        local[part] = candidate.effect.per_state and by_state
     total, shares = np.zeros(4), np.zeros((full.sums.shares.shape[0], 4))
     spent = np.zeros(space.size)
     for fold in range(problem.folds):
@@ -257,7 +256,7 @@ def _determined(curvature: Array, weak: Array, local: BoolArray) -> Array:
 def _count_values(space: Space, spent: Array, shares: Array, noise_known: bool) -> None:
     """Values of single states take degrees of freedom of their capture away; what several share, of all alike."""
     for candidate, part in space.pairs:
-        if isinstance(candidate.effect, ValuePerState):
+        if candidate.effect.per_state:
             mine = slice(None) if candidate.capture is None else candidate.capture
             each = spent[part].sum() / np.size(shares[mine, 1])
             shares[mine, 1] -= each

@@ -11,7 +11,6 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.rules import LEAST_NOISE, NOISE_LEVEL, NOMINAL_TAU, SLACK
 from processing.diagnosis.search.sets import Group, Noise, Quadratic
 from processing.diagnosis.search.space import Problem, Space, Sums
-from processing.instrument.effects.base import ResponseCurve
 
 
 def grouped(space: Space, fixed: Sequence[Candidate]) -> tuple[tuple[tuple[int, ...], ...], list[Group]]:
@@ -24,7 +23,7 @@ def grouped(space: Space, fixed: Sequence[Candidate]) -> tuple[tuple[tuple[int, 
     for mine, family in zip(by_key.values(), families, strict=True):
         index = np.concatenate([np.r_[space.slices[k]] for k in mine]).astype(np.int64)
         always = space.candidates[mine[0]] in fixed
-        curve = isinstance(space.candidates[mine[0]].effect, ResponseCurve)
+        curve = space.candidates[mine[0]].effect.is_response
         price = space.candidates[mine[0]].price
         groups.append(Group(index, float(families.count(family)), NOMINAL_TAU if always else None, curve, price))
     return tuple(tuple(m) for m in by_key.values()), groups

@@ -33,7 +33,6 @@ from processing.diagnosis.search.rules import (
 )
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Problem, Space, Sums
-from processing.instrument.effects.base import PointwiseEffect
 
 #: Called with a line that says what is being done.
 Say = Callable[[str], None]
@@ -94,7 +93,7 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     start : (K,) values to begin with.
     """
     members, groups = grouped(space, fixed)
-    bends = [g for g, own in enumerate(members) if isinstance(space.candidates[own[0]].effect, PointwiseEffect)]
+    bends = [g for g, own in enumerate(members) if space.candidates[own[0]].is_pointwise]
     about, sets, state, others = _found(problem, space, fixed, groups, start=start, bends=bends)
     if problem.noise_known and state.unit > BENT:
         say("structure is left: once more, with every intensity counted in full")

@@ -160,23 +160,11 @@ class Ranked(Section):
     rms_percent: float
 
 
-class Empirical(Section):
-    """A correction that takes structure away without saying what it is. Not an explanation."""
-
-    kind: str
-    rms_percent_in_sample: float
-    values: tuple[float, ...]
-    unit: str
-    would_also_fit: tuple[str, ...]
-    note: str = "empirical: it describes what is left over in these captures and names no cause"
-
-
-class Unexplained(Section):
-    """What is left over, in words, and an empirical correction if one helps."""
+class Unexplained(Section, extra="ignore"):
+    """What is left over, in words, and what was tried; a result of version 0.2.0 has an empirical correction too."""
 
     description: tuple[str, ...]
     tried: tuple[str, ...]
-    empirical: Empirical | None
 
 
 class Check(Section):

@@ -186,12 +186,6 @@ SAME_NM = 0.5
 LEAST_CHANGE = 2e-5
 #: [1] Growth of the condition number of W that a correction may cause: beyond it the states would be other ones.
 WORSE_CONDITION = 1.5
-#: [of the excess] What a correction without a name (an empirical one) has to take away.
-EMPIRICAL_SHARE = 0.1
-#: [of what the best takes] By which another such correction may do worse and still be one that would also fit.
-ALSO = 0.02
-#: [of what is allowed so] By which it may do worse at most.
-ALSO_FITS = 1.5
 #: [of the degrees of freedom] That fitted values leave at least, where nothing is held out.
 LEAST_FREEDOM = 0.2
 #: [of the squared error of M] That the directions hold which are stored of what stays uncertain.

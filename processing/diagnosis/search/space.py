@@ -12,7 +12,6 @@ from scipy.linalg import block_diag
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
-from processing.instrument.effects.base import Switch
 
 
 @dataclass
@@ -107,7 +106,7 @@ class Space:
     @property
     def fixed(self) -> NDArray[np.bool_]:
         """(K,) values that are on or off and not fitted."""
-        return np.array([isinstance(c.effect, Switch) for c in self.candidates for _ in c.parameters], dtype=bool)
+        return np.array([c.effect.is_switch for c in self.candidates for _ in c.parameters], dtype=bool)
 
     def acting(self, capture: int, wavelength_nm: float) -> Acting:
         """What acts on a capture, and where its values stand in the common vector."""

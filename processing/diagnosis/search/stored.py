@@ -7,15 +7,14 @@ from typing import Literal
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
-from processing.instrument.effects.base import OfOneCapture, Switch, ValuePerState
 from processing.instrument.model import EffectParameter
 
 
 def parameters_of(candidate: Candidate, values: Array, stderr: Array) -> dict[str, EffectParameter]:
     """Values by name, each with its standard error."""
-    if isinstance(candidate.effect, Switch):
+    if candidate.effect.is_switch:
         return {"left_out": EffectParameter(value=1.0, unit="1", note="pixels with a clipped state are left out")}
-    if isinstance(candidate.effect, ValuePerState):
+    if candidate.effect.per_state:
         unit = candidate.parameters[0].unit
         return {"states": EffectParameter(value=tuple(values.tolist()), stderr=tuple(stderr.tolist()), unit=unit)}
     return {
@@ -26,7 +25,7 @@ def parameters_of(candidate: Candidate, values: Array, stderr: Array) -> dict[st
 
 def scope_of(candidate: Candidate) -> Literal["instrument", "capture"]:
     """Whether it holds for the instrument or for one capture of it."""
-    return "capture" if isinstance(candidate.effect, OfOneCapture) else "instrument"
+    return "capture" if candidate.effect.of_one_capture else "instrument"
 
 
 def by_wavelength(candidate: Candidate, values: Array, covariance: Array) -> Iterator[tuple[Candidate, Array, Array]]:

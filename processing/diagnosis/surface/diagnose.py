@@ -51,7 +51,6 @@ from processing.diagnosis.surface.standard_errors import bent, standard_errors
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import AppliedEffect, InstrumentModel
 from processing.polarization.image_difference import rmsd
-from processing.reflectance.effects.base import ReflectanceEffect
 from processing.storage.captures.capture import Capture, CaptureError
 
 #: [steps] Of a fit that looks for a deeper minimum in a bent valley.
@@ -76,19 +75,13 @@ def _doubted(search: OwnMinima, here: Visited, cause: Cause) -> bool:
     if cause.probability < LIKELY or cause.log_odds < IMITATES:
         return True
     others = [c for c in here.space.candidates if c not in cause.candidates]
-    rough = max((roughness(c) for c in others), default=0.0)
+    rough = max((c.effect.rough for c in others), default=0.0)
     if not rough or not search.left(here):
         return False
     # Beside an effect whose form is rough, what its form leaves over must not get a name of its own.
     start = search.at(frozenset()).fit.excess
     explained = start - here.fit.excess
     return 2 * cause.log_odds * here.state.unit < rough * explained
-
-
-def roughness(candidate: Candidate) -> float:
-    """Part of what an effect explains that its simple form may leave over."""
-    effect = candidate.effect
-    return effect.rough if isinstance(effect, ReflectanceEffect) else 0.0
 
 
 def solution(problem: SurfaceProblem, search: OwnMinima, here: Visited) -> Solution:
@@ -135,7 +128,7 @@ def recommended(
     if not rivals:
         return "None needed."
     for candidate in rivals:
-        if isinstance(candidate.effect, ReflectanceEffect) and candidate.effect.advice:
+        if candidate.effect.advice:
             return candidate.effect.advice
     if len(rivals) > 1 and _apart(problem, space, fit, rivals) >= APART:
         return "Their signatures differ: repeat the capture with more light or more frames."
@@ -292,7 +285,7 @@ def _unexplained(
         for name, value in beyond_chance(tests).items()
     )
     tried = tuple(c.label for c in likeliest.space.candidates) or tuple(r.candidate for r in ranking[:MOST_TRIED])
-    return Unexplained(description=lines, tried=tried, empirical=None)
+    return Unexplained(description=lines, tried=tried)
 
 
 def constants(problem: SurfaceProblem, space: Space, values: Array) -> dict[str, float]:
@@ -323,7 +316,7 @@ def _explains(
         (y[name] / max(x[name], LIMIT) for x, y in zip(before, after, strict=True) for name in x if y[name] > LIMIT),
         default=0.0,
     )
-    return share <= max(LEFT_OVER, *(roughness(c) for c in candidates), 0.0)
+    return share <= max(LEFT_OVER, *(c.effect.rough for c in candidates), 0.0)
 
 
 def _degeneracy_in_doubt(problem: SurfaceProblem, solved: Solution) -> bool:

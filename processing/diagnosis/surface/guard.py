@@ -11,13 +11,12 @@ from processing.diagnosis.search.result import Check
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.quantities import xi0_of
-from processing.instrument.effects.base import InstrumentEffect
 
 
 def checks(problem: SurfaceProblem, solved: Solution) -> tuple[Check, ...]:
     """Held-out residual before and after; where the optics are corrected, rank and condition of W too."""
     out = [held_out_check(solved)]
-    if any(isinstance(c.effect, InstrumentEffect) for c in solved.effects):
+    if any(c.of_instrument for c in solved.effects):
         for k, data in enumerate(problem.captures):
             before, after = (
                 problem.rows(k, problem.changes(k, space, fit.values)[0])

@@ -23,10 +23,9 @@ from processing.effect import Parameter
 from processing.errors import ProcessError
 from processing.instrument.applied_effects import apply_to, instrument_effects
 from processing.instrument.changes import Changes
-from processing.instrument.effects.base import OpticsEffect
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
-from processing.reflectance.effects.base import MaterialEffect, ReflectanceEffect, reflectance_effects
+from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
 
 #: [typical sizes] Step of a derivative.
 STEP = 1e-4
@@ -116,7 +115,7 @@ class SurfaceProblem:
         for effect in reflectance_effects().values():
             out += [Candidate(effect, p, self._physical(effect, p)) for p in effect.places_on(self.shape)]
         for optics in instrument_effects().values():
-            if isinstance(optics, OpticsEffect):
+            if optics.of_optics:
                 # Sentences without a name imitate smooth patterns over an object.
                 every = optics.places(self.model, conditions)
                 places = [p for p in every if not optics.log_price(self.model, conditions, p)]
@@ -125,8 +124,8 @@ class SurfaceProblem:
 
     def _physical(self, effect: ReflectanceEffect, place: str) -> tuple[Parameter, ...]:
         """The parameters, with bounds that keep k and a of the material from becoming negative."""
-        view, parameters = self.captures[0].view, effect.parameters(place)
-        return effect.physical(parameters, view.index, view.a) if isinstance(effect, MaterialEffect) else parameters
+        view = self.captures[0].view
+        return effect.physical(effect.parameters(place), view.index, view.a)
 
     def powers(self) -> list[tuple[int, Array]]:
         """Rows that the unknowns leave over, and equal power of the smooth patterns that a misfit can have."""

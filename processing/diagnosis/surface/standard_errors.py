@@ -10,7 +10,6 @@ from processing.diagnosis.search.fit import Fit, minimize, prior
 from processing.diagnosis.search.rules import MOST_DOUBLINGS, SHOWN
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
-from processing.reflectance.effects.base import BentValley
 
 #: [typical sizes] From its bound up to which a value stands at it.
 AT_BOUND = 1e-6
@@ -51,7 +50,7 @@ def _covariance(space: Space, fit: Fit, noise_only: Array) -> tuple[Array, Array
 
 def bent(space: Space) -> NDArray[np.bool_]:
     """(K,) values of effects whose valley is bent."""
-    return np.array([isinstance(c.effect, BentValley) for c in space.candidates for _ in c.parameters], dtype=bool)
+    return np.array([c.effect.has_bent_valley for c in space.candidates for _ in c.parameters], dtype=bool)
 
 
 def _wide(problem: SurfaceProblem, space: Space, fit: Fit, j: int, *, step: float, promised: float) -> float:

@@ -15,7 +15,7 @@ from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.model import InstrumentModel
 from processing.reflectance import first_surface, polarized_diffuse
-from processing.reflectance.effects.base import GeometryEffect, MaterialEffect, reflectance_effects
+from processing.reflectance.effects.base import reflectance_effects
 from processing.whole_file import write_new_text
 from processing.yaml_file import dump_yaml
 
@@ -39,9 +39,8 @@ def corrected_geometry(view: ViewingGeometry, diagnosis: SurfaceDiagnosis) -> Vi
     """The geometry with the sphere and the arm's zero where they were found."""
     for effect in diagnosis.applied():
         values = {name: float(p.value) for name, p in effect.parameters.items() if not isinstance(p.value, tuple)}
-        known = reflectance_effects().get(effect.kind)
-        if isinstance(known, GeometryEffect):
-            view = known.corrected(view, values)
+        if effect.kind in reflectance_effects():
+            view = reflectance_effects()[effect.kind].corrected(view, values)
     return view
 
 
@@ -74,13 +73,13 @@ def write_surface(
     if diagnosis.correction.refused is not None:
         raise WriteError(f"{path} was not written: {diagnosis.correction.refused}.")
     kinds = {e.kind for e in diagnosis.applied()}
-    of_surface = [effect for kind, effect in reflectance_effects().items() if kind in kinds]
+    files = {effect.corrects for kind, effect in reflectance_effects().items() if kind in kinds}
     of_instrument = tuple(e for e in diagnosis.applied() if e.kind in instrument_effects())
     models: list[tuple[Path, BaseModel]] = []
     for_material, for_geometry, for_instrument = targets(path)
-    if any(isinstance(e, MaterialEffect) for e in of_surface):
+    if "material" in files:
         models.append((for_material, corrected_material(material, diagnosis)))
-    if any(isinstance(e, GeometryEffect) for e in of_surface):
+    if "geometry" in files:
         models.append((for_geometry, corrected_geometry(view, diagnosis)))
     if of_instrument:
         changed = instrument.model_copy(update={"effects": (*instrument.effects, *of_instrument)})

@@ -17,8 +17,6 @@ from processing.instrument.model import InstrumentModel
 class SentenceEffect(OpticsEffect):
     """What can be wrong and has no name of its own."""
 
-    of_one_capture: bool
-
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(s.text for s in grammar.sentences(model, conditions) if s.of_one_capture == self.of_one_capture)
 
@@ -35,7 +33,7 @@ class SentenceEffect(OpticsEffect):
         return self.moves_image(place) or grammar.parsed(place).quantities == ("blur",)
 
     def acts_on_counts(self, place: str) -> bool:
-        return grammar.parsed(place).site in ("detector", "image")
+        return grammar.parsed(place).site == "image" or self.is_pointwise(place)
 
     def is_pointwise(self, place: str) -> bool:
         return grammar.parsed(place).quantities == ("offset",)

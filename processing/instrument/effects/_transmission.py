@@ -5,14 +5,15 @@ from __future__ import annotations
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import LevelEffect, OpticsEffect, turns
+from processing.instrument.effects.base import OpticsEffect, turns
 from processing.instrument.model import InstrumentModel
 
 
-class Transmission(OpticsEffect, LevelEffect):
+class Transmission(OpticsEffect):
     """Relative change of transmission, once and twice per turn of the element."""
 
     belongs_to = "dispersion"
+    is_level = True
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         return tuple(Parameter(n, "1", -0.3, 0.3, 0.01) for n in ("cos_1", "sin_1", "cos_2", "sin_2"))

@@ -14,14 +14,15 @@ import numpy as np
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import FromFileOnly
+from processing.instrument.effects.base import InstrumentEffect
 from processing.instrument.model import InstrumentModel
 
 
-class AnalyzerRoll(FromFileOnly):
+class AnalyzerRoll(InstrumentEffect):
     """Degrees by which every element of the analyzer is turned."""
 
     belongs_to = "mechanics"
+    from_file_only = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)

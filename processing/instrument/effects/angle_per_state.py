@@ -19,8 +19,6 @@ from processing.instrument.model import InstrumentModel
 class AnglePerState(ValuePerState):
     """Angle error of each state in degrees."""
 
-    describes = "angle_per_state"
-
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return moving_axes(model, conditions)
 

@@ -1,7 +1,4 @@
-"""Effects of an instrument, and the families that the diagnosis asks for.
-
-An effect derives from every family that it belongs to; what belongs to none changes the rows of W and nothing else.
-"""
+"""Effects of an instrument, and families that declare what several of them have in common (see `Effect`)."""
 
 from __future__ import annotations
 
@@ -47,22 +44,6 @@ class InstrumentEffect(Effect, ABC):
         """Log odds by which it is rarer at this place than an effect of the list."""
         return 0.0
 
-    def moves_image(self, place: str) -> bool:
-        """Whether it moves the image at this place, which is undone by moving the frames back."""
-        return False
-
-    def reaches_around(self, place: str) -> bool:
-        """Whether it mixes a pixel with those around it at this place: the image is moved, or blurred."""
-        return self.moves_image(place)
-
-    def acts_on_counts(self, place: str) -> bool:
-        """Whether it changes the counts at this place: the image is moved, or the response is bent or shifted."""
-        return False
-
-    def is_pointwise(self, place: str) -> bool:
-        """Whether it changes every count by itself at this place, so that `undo` gives the counts of the light."""
-        return False
-
     def undo(self, signal: Array, conditions: Conditions, place: str, values: Array) -> tuple[Array, Array]:
         """Signal (N, channels, ...), counts over full scale, without a pointwise effect, exactly, and its slope."""
         raise NotImplementedError(f"{self.kind} at {place!r} is not pointwise")
@@ -75,21 +56,14 @@ class InstrumentEffect(Effect, ABC):
 class OpticsEffect(InstrumentEffect):
     """Changes the polarization elements or the detector channels; a known surface shows it too."""
 
-
-class ChannelLevels(OpticsEffect):
-    """Changes how bright the channels are against each other, and nothing of their polarization."""
+    of_optics = True
 
 
-class LevelEffect(InstrumentEffect):
-    """Changes all channels of a state by one factor: a source whose level is free (`free_source`) takes it up."""
-
-
-class SourceEffect(LevelEffect):
+class SourceEffect(InstrumentEffect):
     """Changes the light of the source, by the same share in the whole image."""
 
-
-class FieldEffect(InstrumentEffect):
-    """Varies over the image, so that every part of it has a W of its own."""
+    of_source = True
+    is_level = True
 
 
 class CountsEffect(InstrumentEffect):
@@ -108,10 +82,6 @@ class PointwiseEffect(CountsEffect):
         return True
 
 
-class ResponseCurve(PointwiseEffect):
-    """The curve from light to counts: a detector has one, whichever of these describes it."""
-
-
 class ImageShift(CountsEffect):
     """Moves the image (`Changes.shift_px`); undone by moving the frames back."""
 
@@ -123,36 +93,13 @@ class OfOneCapture(InstrumentEffect):
     """Would have other values in another capture of the same instrument."""
 
     belongs_to: ClassVar[Belongs] = "capture"
+    of_one_capture = True
 
 
-class Switch(OfOneCapture):
-    """On or off: its parameter is not fitted."""
+class ValuePerState(OfOneCapture):
+    """Parameter k acts on state k alone."""
 
-
-class FromAState(OfOneCapture):
-    """An axis stands wrong from one state on; the state is part of the place."""
-
-    @abstractmethod
-    def axis(self, place: str) -> str:
-        """The axis."""
-
-    @abstractmethod
-    def first_state(self, place: str) -> int:
-        """The state from which on it acts."""
-
-
-class GeneralEffect(InstrumentEffect):
-    """General enough to describe, without a cause, what no other effect explains."""
-
-    describes: ClassVar[str]
-
-
-class ValuePerState(GeneralEffect, OfOneCapture):
-    """Parameter k acts on state k alone (which also makes its derivative cheap)."""
-
-
-class FromFileOnly(InstrumentEffect):
-    """Holds where an instrument file names it, and is not looked for: an unknown sample would take it up."""
+    per_state = True
 
 
 def turned_by(model: InstrumentModel, axis: str) -> Mapping[str, float]:

@@ -12,12 +12,13 @@ from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects._channel import ChannelEffect
-from processing.instrument.effects.base import ChannelLevels
 from processing.instrument.model import InstrumentModel
 
 
-class ChannelGain(ChannelEffect, ChannelLevels):
+class ChannelGain(ChannelEffect):
     """Gain error of each channel but the first, relative to the first; a common factor is throughput."""
+
+    of_channels = True
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         return tuple(Parameter(f"channel_{c.name}", "1", -0.5, 0.5, 0.02) for c in model.channels[1:])

@@ -14,14 +14,14 @@ import numpy as np
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import GeneralEffect, ResponseCurve
+from processing.instrument.effects.base import PointwiseEffect
 from processing.instrument.model import InstrumentModel
 
 
-class DetectorNonlinearity(ResponseCurve, GeneralEffect):
+class DetectorNonlinearity(PointwiseEffect):
     """Fraction c of the signal that is lost at full scale."""
 
-    describes = "response"
+    is_response = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)

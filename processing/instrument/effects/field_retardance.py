@@ -14,13 +14,15 @@ import numpy as np
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import FIELD_TERMS, Changes, Conditions
-from processing.instrument.effects.base import FieldEffect
+from processing.instrument.effects.base import InstrumentEffect
 from processing.instrument.model import InstrumentModel, Retarder
 
 
 #: x and y run from -1 to 1 over the image, to the right and down.
-class FieldRetardance(FieldEffect):
+class FieldRetardance(InstrumentEffect):
     """Coefficients in degrees of x, y, x^2 - 1/3, x y, y^2 - 1/3."""
+
+    varies_over_image = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(e.name for e in model.elements() if isinstance(e, Retarder))

@@ -14,15 +14,16 @@ import numpy as np
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import FromFileOnly
+from processing.instrument.effects.base import InstrumentEffect
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
 
 
-class IlluminationAzimuth(FromFileOnly):
+class IlluminationAzimuth(InstrumentEffect):
     """Degrees by which the polarization behind the generator is turned."""
 
     belongs_to = "mechanics"
+    from_file_only = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)

@@ -14,21 +14,19 @@ import numpy as np
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import FromAState, moving_axes, turned_by
+from processing.instrument.effects.base import OfOneCapture, moving_axes, turned_by
 from processing.instrument.model import InstrumentModel
 
 #: Positions tried along a capture; with more states the nearest of these is named.
 POSITIONS = 64
 
 
-class RotationSlip(FromAState):
+class RotationSlip(OfOneCapture):
     """Angle error in degrees from the state on."""
 
-    def axis(self, place: str) -> str:
-        return place.rpartition("@")[0]
-
-    def first_state(self, place: str) -> int:
-        return int(place.rpartition("@")[2])
+    def slips(self, place: str) -> tuple[str, int]:
+        axis, _, state = place.rpartition("@")
+        return axis, int(state)
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         n = conditions.states
@@ -40,5 +38,5 @@ class RotationSlip(FromAState):
         return (Parameter("slip", "degree", -45, 45, 1.0),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
-        after = np.arange(changes.conditions.states) >= self.first_state(place)
-        changes.turn_axis(self.axis(place), values[0] * after, turned_by(model, self.axis(place)))
+        axis, first = self.slips(place)
+        changes.turn_axis(axis, values[0] * (np.arange(changes.conditions.states) >= first), turned_by(model, axis))

@@ -11,12 +11,14 @@ from collections.abc import Sequence
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Switch
+from processing.instrument.effects.base import OfOneCapture
 from processing.instrument.model import InstrumentModel
 
 
-class Saturation(Switch):
+class Saturation(OfOneCapture):
     """1: pixels with a clipped state are left out; the level is found from the counts, not fitted."""
+
+    is_switch = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)

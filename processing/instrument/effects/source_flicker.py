@@ -19,7 +19,6 @@ from processing.instrument.model import InstrumentModel
 class SourceFlicker(SourceEffect, ValuePerState):
     """Relative error of the gain of each state, common to all channels and pixels."""
 
-    describes = "gain_per_state"
     reference = "m00 is that for the source without what each state differs by"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:

@@ -13,12 +13,14 @@ import numpy as np
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import STRAIGHT_BELOW, Changes, Conditions
-from processing.instrument.effects.base import ResponseCurve
+from processing.instrument.effects.base import PointwiseEffect
 from processing.instrument.model import InstrumentModel
 
 
-class ToneCurve(ResponseCurve):
+class ToneCurve(PointwiseEffect):
     """gamma - 1; light = full scale * (counts / full scale)^gamma."""
+
+    is_response = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)

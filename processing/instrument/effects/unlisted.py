@@ -13,4 +13,3 @@ class Unlisted(SentenceEffect):
     """Values in the unit of the quantity."""
 
     belongs_to = "mechanics"
-    of_one_capture = False

@@ -12,5 +12,3 @@ from processing.instrument.effects.base import OfOneCapture
 
 class UnlistedCourse(SentenceEffect, OfOneCapture):
     """Values in the unit of the quantity."""
-
-    of_one_capture = True

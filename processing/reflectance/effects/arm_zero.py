@@ -12,11 +12,13 @@ from processing.arrays import Array
 from processing.effect import Parameter
 from processing.geometry.viewing import ViewingGeometry
 from processing.reflectance.changes import ReflectanceChanges
-from processing.reflectance.effects.base import GeometryEffect
+from processing.reflectance.effects.base import ReflectanceEffect
 
 
-class ArmZero(GeometryEffect):
+class ArmZero(ReflectanceEffect):
     """Degrees by which the source stands further round than the arm reads."""
+
+    corrects = "geometry"
 
     def parameters(self, place: str) -> tuple[Parameter, ...]:
         return (Parameter("arm", "degree", -10, 10, 0.5),)

@@ -1,11 +1,11 @@
-"""Effects of the reflectance, and the families that the diagnosis asks for: they bend the dominant process."""
+"""Effects of the reflectance: they bend the dominant process."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cache
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from processing.arrays import Array
 from processing.effect import Effect, Parameter, found_in
@@ -19,15 +19,11 @@ ENTRY_POINTS = "umov.reflectance_effects"
 class ReflectanceEffect(Effect, ABC):
     """One thing that the model of a surface can lack.
 
-    Attributes
-    ----------
-    rough : part of what it explains (chi-square) that its simple form may leave over; beside it no effect is named
-        that explains less.
-    advice : the one look or capture that shows it, if there is one, in a sentence.
+    `corrects` says in which file it is corrected. Beside it no effect is named that explains less than it leaves over.
     """
 
-    rough: ClassVar[float] = 1e-3
-    advice: ClassVar[str] = ""
+    corrects: ClassVar[Literal["", "material", "geometry"]] = ""
+    rough = 1e-3
 
     def places_on(self, shape: str) -> Sequence[str]:
         """Where it can act on an object in front of a camera: `shape` is "sphere", "flat" or "mesh"."""
@@ -41,25 +37,13 @@ class ReflectanceEffect(Effect, ABC):
     def bend(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
         """Add the effect of `values` to the changes."""
 
-
-class BentValley(ReflectanceEffect):
-    """Its values trade off along a bent valley: curvature at one point tells neither minimum nor error."""
-
-
-class MaterialEffect(ReflectanceEffect):
-    """Corrected in the material file."""
-
-    @abstractmethod
     def physical(self, parameters: tuple[Parameter, ...], index: complex, a: float) -> tuple[Parameter, ...]:
         """The parameters, bounded by what a material of this index and diffuse weight allows."""
+        return parameters
 
-
-class GeometryEffect(ReflectanceEffect):
-    """Corrected in the geometry file."""
-
-    @abstractmethod
     def corrected(self, view: ViewingGeometry, values: dict[str, float]) -> ViewingGeometry:
         """The geometry with the values found, by name of the parameter."""
+        return view
 
 
 @cache

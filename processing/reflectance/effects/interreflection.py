@@ -13,10 +13,10 @@ import numpy as np
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.reflectance.changes import ReflectanceChanges
-from processing.reflectance.effects.base import BentValley
+from processing.reflectance.effects.base import ReflectanceEffect
 
 
-class Interreflection(BentValley):
+class Interreflection(ReflectanceEffect):
     """Weight of light that met two facets over that which met one; place "support": light from below.
 
     The support's light arrives depolarized from a level disc below, and the surface polarizes it as it does the
@@ -28,6 +28,7 @@ class Interreflection(BentValley):
 
     # A support is no disc, and where its light is cut off by the object itself is not known.
     rough = 0.2
+    has_bent_valley = True
 
     def places_on(self, shape: str) -> Sequence[str]:
         return ("", "support")

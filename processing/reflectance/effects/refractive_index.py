@@ -11,11 +11,14 @@ from dataclasses import replace
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.reflectance.changes import ReflectanceChanges
-from processing.reflectance.effects.base import BentValley, MaterialEffect
+from processing.reflectance.effects.base import ReflectanceEffect
 
 
-class RefractiveIndex(BentValley, MaterialEffect):
+class RefractiveIndex(ReflectanceEffect):
     """What has to be added to n and k; more than these bounds is another material, or no first surface at all."""
+
+    corrects = "material"
+    has_bent_valley = True
 
     def parameters(self, place: str) -> tuple[Parameter, ...]:
         return (Parameter("n", "1", -0.3, 0.3, 0.05), Parameter("k", "1", -0.3, 0.3, 0.05))

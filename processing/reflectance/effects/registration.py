@@ -15,15 +15,16 @@ from processing.effect import Parameter
 from processing.geometry.sphere import Sphere
 from processing.geometry.viewing import ViewingGeometry
 from processing.reflectance.changes import ReflectanceChanges
-from processing.reflectance.effects.base import GeometryEffect
+from processing.reflectance.effects.base import ReflectanceEffect
 
 
-class Registration(GeometryEffect):
+class Registration(ReflectanceEffect):
     """Offset in mm (x to the right, y up) and relative size of a sphere; of bare points, turn of all normals (degrees).
 
     Size stands for the camera's scale as well: one image cannot tell the two apart.
     """
 
+    corrects = "geometry"
     advice = (
         "Find the sphere's outline in the image (`process campaign --register`): it fixes the registration by "
         "itself; a capture at another arm angle tells it from the arm's zero as well."
