@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from processing.diagnosis.search.result import Diagnosis
-from processing.diagnosis.search.rules import SAME_NM
 from processing.errors import ProcessError
 from processing.instrument.model import Dispersive, EffectParameter, InstrumentModel
 from processing.whole_file import write_new_text
 from processing.yaml_file import ConfigError, dump_yaml, parse_yaml
+
+#: [nm] Difference below which two wavelengths are the same in a file that is written.
+SAME_NM = 0.5
 
 
 class WriteError(ProcessError):

@@ -5,11 +5,10 @@ from types import SimpleNamespace as Some
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.mueller_error import MuellerErrors, _leading
+from processing.diagnosis.instrument.mueller_error import MOST_STORED, MuellerErrors, _leading
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.likely_set import likely_set
-from processing.diagnosis.search.rules import MOST_STORED
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets
 from processing.diagnosis.search.space import Space
 from processing.effect import Parameter

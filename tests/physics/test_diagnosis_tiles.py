@@ -8,10 +8,9 @@ from bench_capture import bench_capture, read
 from steady_capture import steady_capture
 
 from processing.diagnosis.instrument.features import FEATURES
-from processing.diagnosis.instrument.moments import moments_of
+from processing.diagnosis.instrument.moments import FOLDS_OF_TILES, moments_of
 from processing.diagnosis.instrument.projection import add_block
 from processing.diagnosis.instrument.tiles import TileSlopes, add_tiles, features_of_tiles, tile_columns
-from processing.diagnosis.search.rules import FOLDS_OF_TILES
 from processing.diagnosis.search.space import Sums
 from processing.instrument.changes import Changes, field_terms
 from simulators.blind.undeclared_captures import TrueBench

@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.diagnosis.captured.capture_data import CaptureData, SharedNoise
-from processing.diagnosis.search.rules import MOST_FITTED
+
+#: [intensities] Of a capture that are fitted; more are averaged over squares of pixels.
+MOST_FITTED = 5_000_000
 
 
 def side_for(values: int, most: int) -> int:

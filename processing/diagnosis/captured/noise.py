@@ -19,24 +19,34 @@ from processing.diagnosis.captured.outliers import NORMAL_MAD, Whitened
 from processing.diagnosis.search.range_of import inside_and_outside, range_of
 from processing.diagnosis.search.rules import (
     DARK_NOISE_OFF,
-    FEW_ROWS,
-    FEWEST_FREE_FOR_NOISE,
     FEWEST_PIXELS,
-    LINES_APART,
-    LIT,
     MOSTLY,
-    NARROWEST,
-    NOISE_ALIKE,
     NOISE_OFF,
-    NOISE_OFF_MIXED,
     NOISE_SURE,
-    NOT_ALIKE_PX,
     OUTSTANDING,
     SHOWN,
     SMALL,
 )
 from processing.instrument.grammar import TIMES, course
 from processing.storage.captures.capture import CaptureError
+
+#: [intensities of a pixel] Up to which every row tells noise that has any: there are no others.
+FEW_ROWS = 4
+#: [pixels] Along a side of an image, below which it tells nothing about noise.
+NARROWEST = 12
+#: [directions] Over the states that the model leaves over, below which they tell nothing about noise.
+FEWEST_FREE_FOR_NOISE = 4
+#: [pixels] Distance over which noise is no longer alike, and the image has hardly changed; and one more.
+NOT_ALIKE_PX = 3
+#: [rows, or columns] Distance of those whose means are compared: next to each other they may share noise.
+LINES_APART = 2
+#: [1] Deviation of the variance of a pixel that is told where neighbours share noise: what a pixel shows of it is not
+#: known better.
+NOISE_OFF_MIXED = 0.15
+#: [correlation] Of neighbours, from which on they share noise.
+NOISE_ALIKE = 0.05
+#: [of the median] Brightness from which on a pixel is lit.
+LIT = 0.5
 
 #: [components, fixed] Of the states that count as signal: a Mueller matrix has 16 unknowns.
 COMPONENTS = 16

@@ -20,25 +20,42 @@ from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.search.range_of import inside_and_outside, range_of
 from processing.diagnosis.search.rules import (
-    AGAINST_NEXT,
-    ALSO_BAD,
-    BAD_DEVIATIONS,
-    BAD_PIXEL,
-    BEYOND_NOISE,
-    DIMMEST,
-    FEWEST_FREE_FOR_HITS,
     FEWEST_OF_MANY,
-    HIT,
-    LEAST_MISFIT,
-    MOST_BAD_FRAMES,
-    MOST_HITS,
-    MOST_STRUCK,
     MOSTLY,
     OUTSTANDING,
-    SIDE_AROUND,
-    SUSPECTS_OF_EXCHANGE,
-    UNPREDICTED,
 )
+
+#: [robust standard deviations] From which on an intensity is a hit: the largest of 10^9 normal ones is 6.1.
+HIT = 8.0
+#: [of the mean variance] Least one that is taken for the usual of a pixel.
+DIMMEST = 0.1
+#: [directions] Over the states that the model leaves over, below which nothing can stand out.
+FEWEST_FREE_FOR_HITS = 8
+#: [states] Of one pixel that are hits; with more of them it is a bad pixel.
+MOST_STRUCK = 4
+#: [of the pixels of a state] Beyond which what stands out is no hit: the frame itself moved, or belongs to nothing.
+MOST_HITS = 0.02
+#: [of the usual variance] From which on a pixel is bad, and up to which the noise of a bright state is believed.
+BAD_PIXEL = 4.0
+#: [standard deviations] By which its variance has to stand out as well, where there are few states.
+BAD_DEVIATIONS = 10.0
+#: [pixels] Side of the square of pixels around: an image that moves makes more of them noisy, a bad pixel is alone.
+SIDE_AROUND = 5
+#: [of the 25 pixels around] That may be as bad: at an edge that moves more of them are.
+ALSO_BAD = 0.2
+#: [of the signal] Rms by which a bad frame differs from what all others predict: a source or an axis that is merely
+#: unsteady stays below.
+LEAST_MISFIT = 0.015
+#: [1] Times by which its misfit is larger, squared, than the next one that is left without it.
+AGAINST_NEXT = 8.0
+#: [of the states] That may be bad.
+MOST_BAD_FRAMES = 0.1
+#: [condition] Of what a state leaves free, from which on the others do not predict it.
+UNPREDICTED = 1e4
+#: [states] With most left over, of which pairs are tried in each other's place.
+SUSPECTS_OF_EXCHANGE = 12
+#: [of the largest eigenvalue of noise] From which on a direction over the states is structure, which all pixels share.
+BEYOND_NOISE = 1.15
 
 #: [standard deviations, fixed] Median of absolute values of normal ones.
 NORMAL_MAD = 0.6745

@@ -17,13 +17,8 @@ from processing.diagnosis.captured.averaged import means, side_for, squares
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.noise import estimated_noise
 from processing.diagnosis.search.rules import (
-    DARK_RIM,
-    FEW_PIXELS,
     FEWEST_PIXELS,
     LIMIT,
-    MANY_VALUES,
-    MOST_CUT_OFF,
-    MOST_READ,
     NOISE_SURE,
     OUTSTANDING,
 )
@@ -36,6 +31,17 @@ from processing.reduction.measurement_matrix import angles_of, measurement_matri
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
 from processing.storage.captures.capture import Capture, CaptureError
+
+#: [pixels] Around dark ones that are left out too: image derivatives over 7 pixels do not tell there what a shift does.
+DARK_RIM = 4
+#: [of its pixels] That are cut off, from which on a state is left out.
+MOST_CUT_OFF = 0.01
+#: [intensities] Of a capture that are read; a larger one is averaged over squares of pixels.
+MOST_READ = 20_000_000
+#: [intensities of a pixel] Beyond which few pixels are kept: second moments of the states would be larger than those.
+MANY_VALUES = 160
+#: [pixels] That are kept then.
+FEW_PIXELS = 64
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,17 @@ from processing.diagnosis.captured.capture_data import CaptureData, LeftOut
 from processing.diagnosis.captured.noise import checked_noise, estimated_noise
 from processing.diagnosis.captured.outliers import bad_frames, outliers_of, without
 from processing.diagnosis.captured.read_capture import without_dark_pixels
-from processing.diagnosis.search.rules import LOST_BY_MOVING, MOST_STEEP, TRIED_PX
 from processing.instrument.applied_effects import changes_of
 from processing.instrument.model import InstrumentModel
 from processing.reduction.move_image import taps
+
+#: [pixels of the sensor] By which frames are moved, and back again, to see what is lost: half of one loses most.
+TRIED_PX = 0.5
+#: [standard deviations of one intensity] By which a pixel is another one after the image was moved by half a pixel and
+#: back, from which on it is at an edge: what an image that moves does there cannot be undone.
+LOST_BY_MOVING = 0.5
+#: [of the pixels] Near an edge that are left out at most; where the image is all edges the flattest pixels are kept.
+MOST_STEEP = 0.75
 
 #: [pixels, or squares of them] From which on nothing of an edge is felt.
 FELT_PX = 8

@@ -38,16 +38,19 @@ from processing.diagnosis.search.rules import (
     FAR_OFF,
     LIKELY,
     MOST_RANKED,
-    OPEN,
     SEEN,
     SMALL,
     SURE,
-    TOGETHER,
 )
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
 from processing.instrument.changes import places
 from processing.instrument.model import AppliedEffect, EffectParameter
+
+#: [correlation] From which on two values are told together.
+TOGETHER = 0.9
+#: [1] Ratio of the largest to the least error among the directions of values that are told together.
+OPEN = 5.0
 
 
 def closure(problem: InstrumentProblem, k: int, space: Space, values: Array) -> float | None:

@@ -18,8 +18,11 @@ from processing.diagnosis.instrument.pixel_sums import Pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.range_of import range_of
-from processing.diagnosis.search.rules import FEWEST_AT_EDGES, LIMIT
+from processing.diagnosis.search.rules import LIMIT
 from processing.diagnosis.search.space import Space
+
+#: [pixels] At edges, from which on they are asked.
+FEWEST_AT_EDGES = 10
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,18 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.posterior import Say
-from processing.diagnosis.search.rules import FAR_DEG, FAR_OFF, MOSTLY, NEAR_DEG, NEAR_ENOUGH, STARTS
+from processing.diagnosis.search.rules import FAR_OFF, MOSTLY
 from processing.diagnosis.search.space import Space
 from processing.instrument.elements import number
+
+#: [of the signal] Residual below which no better start is looked for.
+NEAR_ENOUGH = 0.01
+#: [degree] Half width of the starts of retardances of plates of a known order; and size from which on values have any.
+NEAR_DEG = 20.0
+#: [degree] The same of elements of which no more than "some retardance" is known.
+FAR_DEG = 120.0
+#: [places] From which nominal values are fitted.
+STARTS = 24
 
 #: [of the residual] By which two branches may differ that are the same to the data.
 ALIKE = 1e-3

@@ -21,15 +21,22 @@ from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.features import FEATURES
 from processing.diagnosis.instrument.pixel_sums import Pixels, Precision, features_of_pixels, products_of_pixels
 from processing.diagnosis.search.rules import (
-    FEWEST_PIXELS_FOR_TILES,
-    FOLDS_OF_STATES,
-    FOLDS_OF_TILES,
-    MOST_ROWS_FOR_TILES,
-    MOST_TILES,
-    TILE_PX,
     TILES,
 )
 from processing.instrument.changes import places
+
+#: [intensities of a pixel] Beyond which states are held out, not tiles of the image.
+MOST_ROWS_FOR_TILES = 100
+#: [pixels] Below which states are held out.
+FEWEST_PIXELS_FOR_TILES = 64
+#: [parts] That are held out in turn, of the tiles of an image.
+FOLDS_OF_TILES = 2
+#: [parts] The same of the states, of which there are few.
+FOLDS_OF_STATES = 5
+#: [tiles] Along each side of an image, for effects and structure that vary over it.
+MOST_TILES = 16
+#: [pixels] Along a side of a tile, between these two.
+TILE_PX = 4
 
 #: [of the largest] Eigenvalues of second moments below this are none.
 LEAST_MOMENT = 1e-15

@@ -20,11 +20,18 @@ from processing.diagnosis.search.decision import PredictedChange, predicted_chan
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.range_of import RANK
-from processing.diagnosis.search.rules import MOST_STORED, SMALL_PART, STORED_SHARE, TAKES_PART
+from processing.diagnosis.search.rules import TAKES_PART
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
 from processing.instrument.changes import Changes
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
+
+#: [of the squared error of M] That the directions hold which are stored of what stays uncertain.
+STORED_SHARE = 0.995
+#: [directions] That are stored at most.
+MOST_STORED = 20
+#: [of the largest effect in a direction] Below which another one in it is left out.
+SMALL_PART = 0.03
 
 #: [elements, fixed] Of M/m00 that can be wrong.
 ELEMENTS = 15

@@ -30,11 +30,14 @@ from processing.diagnosis.instrument.slopes import Columns, slopes_of_counts, sl
 from processing.diagnosis.instrument.tiles import add_tiles, slopes_of_tiles, tile_columns
 from processing.diagnosis.search.candidate import Candidate, SourceLevel, nominal_values, pool
 from processing.diagnosis.search.range_of import range_of
-from processing.diagnosis.search.rules import ENOUGH_SOUND, EXACT
+from processing.diagnosis.search.rules import EXACT
 from processing.diagnosis.search.space import Space, Sums
 from processing.instrument.applied_effects import apply_to, changes_of
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
+
+#: [intensities for each unknown] That a pixel has to have without its clipped states: fewer leave next to nothing over.
+ENOUGH_SOUND = 1.5
 
 #: [points] Of expansion that are kept besides the first: each has counts of its own.
 MOST_POINTS = 3

@@ -12,9 +12,14 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.range_of import part_outside
-from processing.diagnosis.search.rules import APART, CLEARLY_MORE, VISIBLE
+from processing.diagnosis.search.rules import APART
 from processing.diagnosis.search.space import Space
 from processing.polarization import mueller
+
+#: [sine] By which another sample has to do better than a simpler one to be asked for.
+CLEARLY_MORE = 0.15
+#: [of the signal] Signature of a typical size below which a capture does not see an effect.
+VISIBLE = 1e-4
 
 #: [typical sizes] Step of a difference of signals.
 STEP = 1e-3

@@ -12,10 +12,9 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.diagnose import Judged
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
-from processing.diagnosis.instrument.structure import Residual, harmonics_of
+from processing.diagnosis.instrument.structure import HARMONICS, Residual, harmonics_of
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.range_of import rank_of
-from processing.diagnosis.search.rules import HARMONICS
 from processing.diagnosis.search.space import Space
 from processing.polarization.cloude import xi0_and_dominant
 from processing.reports.colours import SIGNED, upper_end

@@ -19,10 +19,13 @@ from processing.diagnosis.search.decision import beyond_chance
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.linearized import deviation_of
 from processing.diagnosis.search.range_of import range_of
-from processing.diagnosis.search.rules import FEWEST_OF_MANY, FEWEST_PIXELS, HARMONICS, TILES
+from processing.diagnosis.search.rules import FEWEST_OF_MANY, FEWEST_PIXELS, TILES
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import FIELD_TERMS, Changes, field_terms
 from processing.reduction.move_image import neighbour_noise
+
+#: [harmonics] Of a turn that are shown of a residual: an element that turns makes four.
+HARMONICS = 4
 
 #: [of the largest] Eigenvalues of the light below this are none.
 LEAST_LIGHT = 1e-10

@@ -18,9 +18,14 @@ from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.initial_values import best_of_starts
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.fit import minimize
-from processing.diagnosis.search.rules import DECISIVE, FEW_STARTS, OUTSTANDING, WIRING
+from processing.diagnosis.search.rules import DECISIVE, OUTSTANDING
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
+
+#: [1] Factor by which less must be left over without a mistake of wiring: no small change of a value does that.
+WIRING = 5.0
+#: [places] From which nominal values are fitted for each mistake.
+FEW_STARTS = 5
 
 #: [1, fixed] Ratios of two gears that are taken for one another in rotating-retarder polarimeters.
 GEARS = {"5 instead of 4.91": 5 / 4.91, "4.91 instead of 5": 4.91 / 5}

@@ -19,10 +19,12 @@ from processing.diagnosis.search.rules import (
     LEAST_CHANGE,
     LIMIT,
     LIMIT_OF_TWO,
-    MEASURED,
     WORSE,
     WORSE_CONDITION,
 )
+
+#: [of the largest] Singular value of W from which on a direction is measured.
+MEASURED = 1e-6
 
 
 def held_out_check(solved: Solution, stretch: float = 1.0) -> Check:

@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.diagnosis.search.averages import Samples, sample
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.rules import NOMINAL_TAU, SAMPLES_BEFORE, SETTLED, TAKES_PART
+from processing.diagnosis.search.rules import NOMINAL_TAU, SAMPLES_BEFORE, TAKES_PART
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Problem, Space, Sums
+
+#: [standard deviations] A move of the solution below which no new linearization is needed.
+SETTLED = 0.3
 
 #: [steps] Of a descent.
 STEPS = 6

@@ -13,8 +13,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.search.rules import FLAT, SMOOTH
+from processing.diagnosis.search.rules import SMOOTH
 from processing.effect import Parameter
+
+#: [of the variance of the largest] Principal curves of such values below which nothing is told of them.
+FLAT = 1e-6
 
 
 @dataclass(frozen=True)

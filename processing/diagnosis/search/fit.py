@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array, BoolArray
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.rules import LEAST_FREEDOM
 from processing.diagnosis.search.space import Problem, Space, Sums
+
+#: [of the degrees of freedom] That fitted values leave at least, where nothing is held out.
+LEAST_FREEDOM = 0.2
 
 #: [typical sizes] Width of the prior that keeps unseen parameters still.
 PRIOR_WIDTH = 10.0

@@ -6,8 +6,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.diagnosis.search.rules import HOPE, NEEDED, PATIENCE
+from processing.diagnosis.search.rules import HOPE, NEEDED
 from processing.diagnosis.search.sets import NEVER, Sets, State
+
+#: [changes] That are tried one after the other without a gain before a climb ends.
+PATIENCE = 8
 
 #: [changes] Of a set in one climb.
 STEPS = 60

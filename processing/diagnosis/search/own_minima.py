@@ -19,9 +19,14 @@ from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.likely_set import retune
 from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
 from processing.diagnosis.search.posterior import Posterior, Say
-from processing.diagnosis.search.rules import BOUND, ENOUGH, EXPLAINS, HOPE, IMITATES, LEADERS
+from processing.diagnosis.search.rules import BOUND, EXPLAINS, HOPE, IMITATES
 from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Problem, Space
+
+#: [groups] That are fitted beside a set of effects of a surface: what one step promises says little there.
+LEADERS = 12
+#: [unit of chi-square] A fit of a set ends when a step gains less, and a far start is taken that gains more.
+ENOUGH = 0.05
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,8 +36,6 @@ NOMINAL_GAIN = 0.1
 #: [of a factor e in wavelength] Length over which values of optics stay alike from one wavelength to another: an
 #: achromatic plate bends once over an octave, a coating a few times.
 SMOOTH = 0.3
-#: [of the variance of the largest] Principal curves of such values below which nothing is told of them.
-FLAT = 1e-6
 
 # ---- noise ---------------------------------------------------------------------------------------------------------
 #: [standard deviations] Total excess over the noise's own chi-square up to which it is no structure.
@@ -48,76 +46,20 @@ NOISE_LEVEL = 0.005
 #: [of the signal] Least residual that is taken as noise where the noise is not known: no bench repeats better.
 LEAST_NOISE = 1e-4
 
-#: [intensities of a pixel] Up to which every row tells noise that has any: there are no others.
-FEW_ROWS = 4
 
 # ---- what is left out of a capture ---------------------------------------------------------------------------------
-#: [pixels] Around dark ones that are left out too: image derivatives over 7 pixels do not tell there what a shift does.
-DARK_RIM = 4
-#: [of its pixels] That are cut off, from which on a state is left out.
-MOST_CUT_OFF = 0.01
-#: [pixels of the sensor] By which frames are moved, and back again, to see what is lost: half of one loses most.
-TRIED_PX = 0.5
-#: [standard deviations of one intensity] By which a pixel is another one after the image was moved by half a pixel and
-#: back, from which on it is at an edge: what an image that moves does there cannot be undone.
-LOST_BY_MOVING = 0.5
-#: [of the pixels] Near an edge that are left out at most; where the image is all edges the flattest pixels are kept.
-MOST_STEEP = 0.75
-#: [robust standard deviations] From which on an intensity is a hit: the largest of 10^9 normal ones is 6.1.
-HIT = 8.0
-#: [of the mean variance] The same of a dim pixel, at least.
-DIMMEST = 0.1
 #: [pixels, pairs] Below which nothing can stand out, neighbours are not compared, and an object tells nothing.
 FEWEST_OF_MANY = 100
-#: [directions] Over the states that the model leaves over, below which nothing can stand out.
-FEWEST_FREE_FOR_HITS = 8
-#: [states] Of one pixel that are hits; with more of them it is a bad pixel.
-MOST_STRUCK = 4
-#: [of the pixels of a state] Beyond which what stands out is no hit: the frame itself moved, or belongs to nothing.
-MOST_HITS = 0.02
-#: [of the usual variance] From which on a pixel is bad, and up to which the noise of a bright state is believed.
-BAD_PIXEL = 4.0
-#: [standard deviations] By which its variance has to stand out as well, where there are few states.
-BAD_DEVIATIONS = 10.0
-#: [pixels] Side of the square of pixels around: an image that moves makes more of them noisy, a bad pixel is alone.
-SIDE_AROUND = 5
-#: [of the 25 pixels around] That may be as bad: at an edge that moves more of them are.
-ALSO_BAD = 0.2
-#: [of the signal] Rms by which a bad frame differs from what all others predict: a source or an axis that is merely
-#: unsteady stays below.
-LEAST_MISFIT = 0.015
-#: [1] Times by which its misfit is larger, squared, than the next one that is left without it.
-AGAINST_NEXT = 8.0
 #: [of the residual] That a bad frame, a far start or a round of a search has to take away.
 MOSTLY = 0.5
-#: [of the states] That may be bad.
-MOST_BAD_FRAMES = 0.1
-#: [condition] Of what a state leaves free, from which on the others do not predict it.
-UNPREDICTED = 1e4
-#: [states] With most left over, of which pairs are tried in each other's place.
-SUSPECTS_OF_EXCHANGE = 12
-#: [intensities for each unknown] That a pixel has to have without its clipped states: fewer leave next to nothing over.
-ENOUGH_SOUND = 1.5
 
 # ---- the detector's noise, as its images show it ------------------------------------------------------------------
-#: [of the largest eigenvalue of noise] From which on a direction over the states is structure, which all pixels share.
-BEYOND_NOISE = 1.15
-#: [pixels] Along a side of an image, below which it tells nothing about noise.
-NARROWEST = 12
-#: [directions] Over the states that the model leaves over, below which they tell nothing about noise.
-FEWEST_FREE_FOR_NOISE = 4
-#: [pixels] Distance over which noise is no longer alike, and the image has hardly changed; and one more.
-NOT_ALIKE_PX = 3
-#: [rows, or columns] Distance of those whose means are compared: next to each other they may share noise.
-LINES_APART = 2
 #: [standard deviations] From which on the noise, or an effect over the image, differs from what is declared; and below
 #: black, from which on counts of zero are cut off.
 NOISE_SURE = 6.0
 #: [1] Deviation of the variance of a pixel from what is declared that is told: photon transfer curves of a lab are as
 #: good.
 NOISE_OFF = 0.06
-#: [1] The same where neighbours share noise: how much a pixel shows of it is not known better.
-NOISE_OFF_MIXED = 0.15
 #: [1] The same of the part of the variance without light: darks of a lab are as good.
 DARK_NOISE_OFF = 0.5
 #: [of the whole] Below which a part tells nothing: of the variance with or without light, of the scatter of a row, of
@@ -126,20 +68,10 @@ SMALL = 0.05
 #: [1] Deviation of the variance from what is declared where a bend of the response is undone, beyond which that bend
 #: does not go with how the counts scatter: two standard deviations of what labs know of a gain.
 GAIN_OFF = 0.03
-#: [correlation] Of neighbours, from which on they share noise.
-NOISE_ALIKE = 0.05
-#: [of the median] Brightness from which on a pixel is lit.
-LIT = 0.5
 
 # ---- search --------------------------------------------------------------------------------------------------------
 #: [of the signal] Residual above which nominal values, and what else has far starts, are searched for from many starts.
 FAR_OFF = 0.05
-#: [of the signal] Residual below which no better start is looked for.
-NEAR_ENOUGH = 0.01
-#: [degree] Half width of the starts of retardances of plates of a known order; and size from which on values have any.
-NEAR_DEG = 20.0
-#: [degree] The same of elements of which no more than "some retardance" is known.
-FAR_DEG = 120.0
 #: [unit of chi-square] After the first choice of groups, from which on the first linearization is not believed.
 BENT = 2.0
 #: [log odds] Loss of a change of the set, or of a new linearization, that is still tried: the unit of chi-square may
@@ -160,12 +92,6 @@ EXACT = 0.3
 #: [log odds] At which a group is certain and is not tested any more. A name needs as much where the residual alone
 #: measures the noise, since part of the residual may be structure.
 CERTAIN = 25.0
-#: [unit of chi-square] A fit of a set ends when a step gains less, and a far start is taken that gains more.
-ENOUGH = 0.05
-
-# ---- wiring --------------------------------------------------------------------------------------------------------
-#: [1] Factor by which less must be left over without a mistake of wiring: no small change of a value does that.
-WIRING = 5.0
 
 # ---- correction ----------------------------------------------------------------------------------------------------
 #: [probability] From which on a group takes part in the correction that is written. What is less likely moves the mean
@@ -178,22 +104,10 @@ WORSE = 1.002
 #: [probability] That the error of what the user reads grows by a correction, up to which it is written: below it the
 #: expected error falls.
 CHANCE_WORSE = 0.5
-#: [of the largest] Singular value of W from which on a direction is measured.
-MEASURED = 1e-6
-#: [nm] Difference below which two wavelengths are the same in a file that is written.
-SAME_NM = 0.5
 #: [of m00] Least change of M/m00 that is asked for its error: less is the rounding of counts.
 LEAST_CHANGE = 2e-5
 #: [1] Growth of the condition number of W that a correction may cause: beyond it the states would be other ones.
 WORSE_CONDITION = 1.5
-#: [of the degrees of freedom] That fitted values leave at least, where nothing is held out.
-LEAST_FREEDOM = 0.2
-#: [of the squared error of M] That the directions hold which are stored of what stays uncertain.
-STORED_SHARE = 0.995
-#: [directions] That are stored at most.
-MOST_STORED = 20
-#: [of the largest effect in a direction] Below which another one in it is left out.
-SMALL_PART = 0.03
 
 # ---- structure -----------------------------------------------------------------------------------------------------
 #: [standard deviations] Beyond which a test of the residual says "structure", and a pixel is not dark.
@@ -202,24 +116,10 @@ LIMIT = 5.0
 LIMIT_OF_TWO = 3.5
 #: [pixels] Below which means over them tell no noise, no black level and no pattern.
 FEWEST_PIXELS = 30
-#: [harmonics] Of a turn that are shown of a residual: an element that turns makes four.
-HARMONICS = 4
 
 # ---- what is held out, and parts of an image ------------------------------------------------------------------------
-#: [intensities of a pixel] Beyond which states are held out, not tiles of the image.
-MOST_ROWS_FOR_TILES = 100
-#: [pixels] Below which states are held out.
-FEWEST_PIXELS_FOR_TILES = 64
-#: [parts] That are held out in turn, of the tiles of an image.
-FOLDS_OF_TILES = 2
-#: [parts] The same of the states, of which there are few.
-FOLDS_OF_STATES = 5
-#: [tiles] Along each side of an image, for effects and structure that vary over it.
-MOST_TILES = 16
 #: [tiles] Along a side of a small image, of an object, and of the patches whose means are tested.
 TILES = 8
-#: [pixels] Along a side of a tile, between these two.
-TILE_PX = 4
 
 # ---- names ---------------------------------------------------------------------------------------------------------
 #: [probability] From which on a cause is called sure.
@@ -246,8 +146,6 @@ BOUND = 1e-3
 #: to move. Where it does they show 0.5 to 1.1 of it, and it explains 0.5 to 0.7 of what they do; of light that is
 #: added, or a spot that fades, one of the two is 0 to 0.4.
 EDGES = 0.43
-#: [pixels] At edges, from which on they are asked.
-FEWEST_AT_EDGES = 10
 #: [of what it explains] The same, for a large effect.
 UNEVEN_SHARE = 0.01
 #: [of the directions of the data] What values for each state, with all others, may have.
@@ -255,12 +153,6 @@ TESTABLE = 0.75
 #: [1] With structure left something is there that is not in the list, and causes that are may be parts of it: one alone
 #: has to explain this many times what is left, the second strongest four times as much, the third nine times, ...
 TIMES = 100.0
-
-# ---- values that are told together ---------------------------------------------------------------------------------
-#: [correlation] From which on two values are told together.
-TOGETHER = 0.9
-#: [1] Ratio of the largest to the least error among the directions of values that are told together.
-OPEN = 5.0
 
 # ---- what captures can show ----------------------------------------------------------------------------------------
 #: [chi-square] Two standard deviations: information about a typical size below which an effect cannot be seen, and what
@@ -271,10 +163,6 @@ SEEN = 4.0
 OUTSTANDING = 4.0
 #: [sine] Of the angle between two signatures, from which on a capture tells them apart.
 APART = 0.3
-#: [sine] By which another sample has to do better than a simpler one to be asked for.
-CLEARLY_MORE = 0.15
-#: [of the signal] Signature of a typical size below which a capture does not see an effect.
-VISIBLE = 1e-4
 
 # ---- surfaces ------------------------------------------------------------------------------------------------------
 #: [log odds] That a group needs: smooth patterns over an object imitate each other.
@@ -282,60 +170,15 @@ IMITATES = 20.0
 #: [of what is left over] What a group must explain to be added while structure is left: several that each take a little
 #: together imitate nearly any smooth pattern.
 EXPLAINS = 0.3
-#: [of each test's excess] What may be left where something is named all the same.
-LEFT_OVER = 0.03
-#: [1] More effects than this at once are not an explanation.
-MOST_EFFECTS = 3
-#: [of the signal] Structure up to which a linear Stokes camera cannot tell an effect from small eigenvalues that are
-#: not equal: apart by what the paper saw (9 % at 451 nm, 3 % at 662 nm) they leave 0.1 to 2 % on the simulated sphere.
-AS_LIKELY = 0.015
-#: [of the median] Brightness below which a pixel of an object is shadow or background.
-DARK = 0.1
-#: [of the noise of a pixel] Modulated light of a tile from which on its pixels have a say in the dominant process.
-LEAST_MODULATION = 1.0
-#: [pixels] Of an object that are used at most, evenly spread.
-MOST_OF_OBJECT = 4000
-#: [of its radius] Rim of an object that is left out: one off its place would mix object and background there.
-RIM_OF_OBJECT = 0.06
-#: [pixels of the camera] The same, at least: the interpolation of a mosaic mixes as many.
-RIM_PX = 6
-#: [degree] Half angle in which the middle of an object sees its support.
-SUPPORT_DEG = 35.0
-#: [half widths of the object] From its middle down to the support.
-SUPPORT_DEPTH = 2.0
-#: [typical sizes] Along a bent valley, from where a deeper minimum is looked for.
-ALONG_VALLEY = 1.0
-#: [doublings] By which an error may grow at most as a bent valley asks.
-MOST_DOUBLINGS = 5
-#: [of its noise] Polarized light of a pixel from which on its xi0 is shown.
-SHOWS_XI0 = 20.0
 
 # ---- effort: what a search may cost --------------------------------------------------------------------------------
 #: [rounds] Times that the problem is linearized anew about its solution.
 ROUNDS = 7
 #: [rounds] The same where the noise is not known: each makes what is left smaller, which is then taken for the noise.
 FEWER_ROUNDS = 4
-#: [standard deviations] A move of the solution below which no new linearization is needed.
-SETTLED = 0.3
 #: [changes] Of a chain in the last round.
 CHANGES = 1000
 #: [sets] That are visited in the last round where what is left is the noise.
 SAMPLES = 300
 #: [sets] That are visited in the rounds before.
 SAMPLES_BEFORE = 80
-#: [changes] That are tried one after the other without a gain before a climb ends.
-PATIENCE = 8
-#: [groups] That are fitted beside a set of effects of a surface: what one step promises says little there.
-LEADERS = 12
-#: [places] From which nominal values are fitted.
-STARTS = 24
-#: [places] The same for each mistake of wiring.
-FEW_STARTS = 5
-#: [intensities] Of a capture that are read; a larger one is averaged over squares of pixels.
-MOST_READ = 20_000_000
-#: [intensities] Of a capture that are fitted; more are averaged over squares of pixels.
-MOST_FITTED = 5_000_000
-#: [intensities of a pixel] Beyond which few pixels are kept: second moments of the states would be larger than those.
-MANY_VALUES = 160
-#: [pixels] That are kept then.
-FEW_PIXELS = 64

@@ -12,12 +12,7 @@ from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.search.rules import (
-    DARK,
     FEWEST_OF_MANY,
-    LEAST_MODULATION,
-    MOST_OF_OBJECT,
-    RIM_OF_OBJECT,
-    RIM_PX,
     TILES,
 )
 from processing.diagnosis.surface.view import SurfaceView
@@ -31,6 +26,17 @@ from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
 from processing.reflectance.base import ReflectanceModel
 from processing.storage.captures.capture import Capture
+
+#: [of the median] Brightness below which a pixel of an object is shadow or background.
+DARK = 0.1
+#: [of the noise of a pixel] Modulated light of a tile from which on its pixels have a say in the dominant process.
+LEAST_MODULATION = 1.0
+#: [pixels] Of an object that are used at most, evenly spread.
+MOST_OF_OBJECT = 4000
+#: [of its radius] Rim of an object that is left out: one off its place would mix object and background there.
+RIM_OF_OBJECT = 0.06
+#: [pixels of the camera] The same, at least: the interpolation of a mosaic mixes as many.
+RIM_PX = 6
 
 #: [parts, fixed] Of the object that are held out in turn, as a chessboard has them.
 FOLDS = 2

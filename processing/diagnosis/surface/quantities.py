@@ -6,12 +6,14 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.search.range_of import rank_of
-from processing.diagnosis.search.rules import SHOWS_XI0
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfacePixels, SurfaceProblem
 from processing.polarization.cloude import xi0_and_dominant
 from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
 from processing.section import Section
+
+#: [of its noise] Polarized light of a pixel from which on its xi0 is shown.
+SHOWS_XI0 = 20.0
 
 
 class SurfaceQuantities(Section):

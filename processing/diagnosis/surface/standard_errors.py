@@ -7,9 +7,12 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.search.fit import Fit, minimize, prior
-from processing.diagnosis.search.rules import MOST_DOUBLINGS, SHOWN
+from processing.diagnosis.search.rules import SHOWN
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
+
+#: [doublings] By which an error may grow at most as a bent valley asks.
+MOST_DOUBLINGS = 5
 
 #: [typical sizes] From its bound up to which a value stands at it.
 AT_BOUND = 1e-6

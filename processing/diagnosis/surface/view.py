@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay
 
 from processing.arrays import Array
-from processing.diagnosis.search.rules import SUPPORT_DEG, SUPPORT_DEPTH
 from processing.errors import ProcessError
 from processing.geometry.frames import ScatteringGeometry, dot, unit
 from processing.geometry.pinhole import PinholeCamera
@@ -22,6 +21,11 @@ from processing.polarization import mueller
 from processing.reflectance import first_surface, polarized_diffuse
 from processing.reflectance.base import ReflectanceModel, constants_at
 from processing.reflectance.changes import ReflectanceChanges
+
+#: [degree] Half angle in which the middle of an object sees its support.
+SUPPORT_DEG = 35.0
+#: [half widths of the object] From its middle down to the support.
+SUPPORT_DEPTH = 2.0
 
 #: [parts] Of the support, a level disc.
 SUPPORT_PARTS = 16

@@ -7,8 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from processing.diagnosis.instrument_file import WriteError, file_head
-from processing.diagnosis.search.rules import SAME_NM
+from processing.diagnosis.instrument_file import SAME_NM, WriteError, file_head
 from processing.diagnosis.surface.diagnose import SurfaceDiagnosis
 from processing.doors import require_new
 from processing.geometry.viewing import ViewingGeometry
