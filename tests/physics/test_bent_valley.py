@@ -11,7 +11,7 @@ from processing.diagnosis.search.linearized import quadratic
 from processing.diagnosis.search.posterior import _posterior_of
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Space, Sums
-from processing.effect import Parameter
+from processing.effect import Effect, Parameter
 
 
 class Valley:
@@ -47,7 +47,7 @@ class Valley:
 
 @pytest.fixture
 def space() -> Space:
-    effect = SimpleNamespace(kind="it")
+    effect = Effect()
     return Space(tuple(Candidate(effect, place, (Parameter("p", "1", -99.0, 99.0, 1.0),)) for place in "xy"))
 
 

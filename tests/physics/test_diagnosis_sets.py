@@ -16,7 +16,7 @@ from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import FEW_CAUSES, TAU, TAU_WEIGHT
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State
 from processing.diagnosis.search.space import Space
-from processing.effect import Parameter
+from processing.effect import Effect, Parameter
 from processing.instrument.effects.rotation_slip import RotationSlip
 
 #: Nothing but noise, whose unit is one.
@@ -164,7 +164,7 @@ def test_two_that_say_the_same_share_the_mean(average):
 
 def test_a_descent_stays_where_the_model_has_numbers():
     """A step to where there are no intensities is no gain, though nan is not larger than anything."""
-    space = Space((Candidate(type("E", (), {"kind": "it"})(), "", (Parameter("p", "1", -9.0, 9.0, 1.0),)),))
+    space = Space((Candidate(Effect(), "", (Parameter("p", "1", -9.0, 9.0, 1.0),)),))
 
     def sums(space, x, derivatives=True):
         excess = 25.0 if x[0] == 0 else np.nan

@@ -1,7 +1,5 @@
 """A search that counts every intensity in full finds what leaves nothing but noise, and believes nothing else."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -9,10 +7,16 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.down_to_noise import down_to_noise
 from processing.diagnosis.search.linearized import grouped, noise_of
 from processing.diagnosis.search.space import Space, Sums
-from processing.effect import Parameter
+from processing.effect import Effect, Parameter
 
 STATES, SINGLE, PIXELS = 24, 17, 5000
 FREEDOM, DIRECTIONS = 2.0 * STATES * PIXELS, 40
+
+
+def effect_of(kind: str) -> Effect:
+    effect = Effect()
+    effect.kind = kind
+    return effect
 
 
 class Bench:
@@ -70,7 +74,7 @@ def bench() -> tuple[Space, np.ndarray, np.ndarray, np.ndarray]:
         Space(
             tuple(
                 Candidate(
-                    SimpleNamespace(kind=f"cause_{k}"),
+                    effect_of(f"cause_{k}"),
                     str(first[k]),
                     tuple(Parameter(f"p{i}", "1", -9.0, 9.0, 1.0) for i in range(n)),
                 )
