@@ -5,7 +5,6 @@ Jarecki and Kupinski, Sec. V-C.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -144,10 +143,15 @@ class ExtrapolatedImage:
         """(16, rows, columns): elements but 00 move by this times one common factor, up to the sign of alpha_0."""
         return np.asarray((np.sign(self.values) * self.errors).reshape(16, *self.correlation.shape), dtype=float)
 
-    def moments_of(self, elements: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Traces (rows, columns) of C and C^2, C being the covariance of these elements: they have one error."""
-        total = np.square(self.errors.reshape(16, *self.correlation.shape)[list(elements)].astype(float)).sum(axis=0)
-        return total, total**2
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance (rows, columns, 16, 16) of the elements: they have two errors."""
+        common = np.moveaxis(self._signed, 0, -1)
+        common[..., 0] = 0.0
+        found = common[..., :, None] * common[..., None, :]
+        m00 = self.errors[0, 0].astype(float)
+        found[..., 0, :] = found[..., :, 0] = (self.correlation * m00)[..., None] * common
+        found[..., 0, 0] = m00**2
+        return found
 
     def variance_of(self, gradient: NDArray[np.floating]) -> NDArray[np.float64]:
         """First-order variance (rows, columns) of a quantity with gradient (rows, columns, 16) by the elements."""

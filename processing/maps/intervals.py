@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from processing.arrays import Array
+from processing.arrays import Array, RealArray
 from processing.polarization.eigenvalue_noise import CorrectedXi0, EigenvalueNoise
-from processing.polarization.magnitude import NORMAL_95, directions, interval, sum_of_singular_values
+from processing.polarization.magnitude import NORMAL_95, directions, interval, positive, sum_of_singular_values
 from processing.polarization.propagation import Derived
 from processing.polarization.quantities import entropy
-from processing.polarization.scalar_files import scalar_quantities
 from processing.polarization.sorted_eigenvalues import of_gaps
+from processing.polarization.vector_noise import of_elements, of_slopes
 from processing.reduction.systematic import Systematic
 from processing.storage.products.images import MuellerImage
 
@@ -33,19 +33,22 @@ FLIPPED = (0.2, 0.02)
 APART = 5.0
 #: Equal eigenvalues are seen apart by the noise between them times the root of this, on average.
 _REPELLED = 4.0
+#: Parts of the light not in the dominant process between which entropy passes from that of a nearly pure sample to that
+#: of a depolarizer, and errors of the depolarization index from which on its own bend is seen.
+PURE, FLAT = (0.15, 0.45), 5.0
 #: A rotation is determined where the weakest factor that it is divided by is this many times its noise.
 SEEN = 3.0
 EITHER_AXIS = "retardance_axis_or_90_deg"
-#: Angles whose range is all directions, by what they are angles of.
-ANGLES = (
-    "diattenuation_orientation_deg",
-    "polarizance_orientation_deg",
-    "dominant_diattenuation_orientation_deg",
-    "dominant_polarizance_orientation_deg",
-    "retardance_fast_axis_deg",
-    EITHER_AXIS,
-    "differential_retardance_fast_axis_deg",
-)
+#: Angles whose range is all directions, by the length of the vector that they are the angle of.
+ANGLES_OF = {
+    **{
+        f"{name}_linear": (f"{name}_orientation_deg",)
+        for name in ("diattenuation", "polarizance", "dominant_diattenuation", "dominant_polarizance")
+    },
+    "retardance_linear_deg": ("retardance_fast_axis_deg", EITHER_AXIS),
+    "differential_retardance_linear_deg": ("differential_retardance_fast_axis_deg",),
+}
+ANGLES = tuple(angle for each in ANGLES_OF.values() for angle in each)
 #: Ranges of what the differential decomposition gives; where it does not exist any of them may be.
 DIFFERENTIAL = {
     "retardance_deg": (0.0, 180.0),
@@ -56,86 +59,74 @@ DIFFERENTIAL = {
     **{f"depolarization_{k}": (-np.inf, np.inf) for k in (1, 2, 3)},
 }
 SIGNED = ("retardance_circular_deg", "retardance_vector_deg")
-#: Maps whose 95 % interval is a plane of its own; of all others it is value +- 1.96 error.
-OWN_95 = (
-    *ANGLES,
-    *SIGNED,
-    *(f"{name}{part}" for name in ("diattenuation", "polarizance") for part in ("", "_linear")),
-    *(f"dominant_{name}_{part}" for name in ("diattenuation", "polarizance") for part in ("linear", "circular")),
-    "polarizance_ellipticity_deg",
-    "coherency_eigenvalues",
-    "eigenvalue_deviation",
-    "entropy",
-    "depolarization_index",
-    "depolarization_power",
-    "retardance_deg",
-    "retardance_linear_deg",
-    *(f"symmetric_d{k}" for k in (1, 2, 3)),
-    *(f"differential_{short}" for short in DIFFERENTIAL),
+#: What a quantity can be, by the end of its name; of angles see `set_ratios`.
+RANGES: tuple[tuple[str, tuple[float, float] | tuple[tuple[float, ...], tuple[float, ...]]], ...] = (
+    *((f"differential_{short}", bounds) for short, bounds in DIFFERENTIAL.items()),
+    *((f"retardance_{part}deg", (0.0, 180.0)) for part in ("", "linear_")),
+    *((name, (-180.0, 180.0)) for name in SIGNED),
+    ("ellipticity_deg", (-45.0, 45.0)),
+    ("coherency_eigenvalues", ((0.25, 0.0, 0.0, 0.0), (1.0, 1 / 2, 1 / 3, 1 / 4))),
+    ("eigenvalue_deviation", (-1 / 3, 1 / 3)),
+    ("_circular", (-1.0, 1.0)),
+    *((f"symmetric_d{k}", (-1.0, 1.0)) for k in (1, 2, 3)),
+    ("dominant_mueller_jones", (-1.0, 1.0)),
+    *((name, (0.0, 1.0)) for name in ("entropy", "td_missed", "diattenuation", "polarizance", "_linear")),
+    *((f"depolarization_{part}", (0.0, 1.0)) for part in ("index", "power")),
 )
+#: Relative error of m00 from which on the ratio to it has an interval of its own: below, that would change the longest
+#: one by a hundredth.
+UNEVEN = 0.03
 
 
 def has_own_95(name: str) -> bool:
-    """Whether a map has a plane `<name>_95`."""
-    scalar = scalar_quantities().get(name)
-    return name in OWN_95 or (scalar is not None and bool(scalar.elements))
+    """Whether a map has a plane `<name>_95`: 32 more numbers a pixel would be of little use."""
+    return name != "dominant_mueller_jones"
 
 
 class ElementNoise(Protocol):
     """What an image knows of the errors of its elements."""
 
-    def variance_of(self, gradient: NDArray[np.floating]) -> Array: ...
-
-    def moments_of(self, elements: tuple[int, ...]) -> tuple[Array, Array]: ...
+    def covariance(self) -> NDArray[np.floating]: ...
 
 
 def set_magnitudes(
     planes: Planes, derived: Mapping[str, Derived], m: Array, image: ElementNoise, *, widened: Array | float = 1.0
 ) -> None:
-    """Replace value and error of every length of a vector, and add its 95 % interval.
+    """Replace value and error of every length of a vector and of every angle, and add their 95 % intervals.
 
     Parameters
     ----------
     m : (..., 4, 4), the matrices of which `derived` is.
     widened : (...), factor by which the errors of the dominant process are larger than to first order.
     """
+    covariance = image.covariance()
     for name, quantity in derived.items():
         if name not in planes or not (quantity.elements or quantity.parts is not None):
             continue
-        along = np.square(planes[f"{name}_errors"].astype(float))
-        total, square = _moments(quantity, m, image)
+        if quantity.parts is None:
+            noise = of_elements(covariance, m, quantity.elements)
+            vector: RealArray = np.moveaxis(m.reshape(*m.shape[:-2], 16)[..., quantity.elements], -1, 0)
+            # How the length is normalized.
+            scale = np.square(quantity.value * m[..., 0, 0]) / np.square(vector).sum(axis=0)
+        else:
+            vector, scale = quantity.parts.value, np.ones(())
+            noise = of_slopes(covariance, vector, quantity.parts.gradient)
         if name.startswith("dominant_"):
-            total, square = total * np.square(widened), square * np.power(widened, 4)
-        _put(planes, name, *interval(np.asarray(quantity.value, dtype=float), along, total, square))
+            scale = scale * np.square(widened)
+        length = np.asarray(quantity.value, dtype=float)
+        moments = (scale * noise.along, scale * noise.total, scale**2 * noise.square)
+        _put(planes, name, *interval(length, *moments, below=scale * noise.below, above=scale * noise.above))
+        for angle in ANGLES_OF.get(name, ()):
+            if angle in planes:
+                _set_angle(planes, angle, length * vector / np.hypot(*vector), scale * noise.packed[[0, 1, 3]])
 
 
-def _moments(quantity: Derived, m: Array, image: ElementNoise) -> tuple[Array, Array]:
-    """tr C and tr C^2 of the vector whose length a quantity is."""
-    if quantity.parts is None:
-        vector = m.reshape(*m.shape[:-2], 16)[..., quantity.elements]
-        # How the length is normalized.
-        scale = np.square(quantity.value) / np.square(vector).sum(axis=-1)
-        total, square = image.moments_of(quantity.elements)
-        return scale * total, scale**2 * square
-    own = [image.variance_of(part) for part in quantity.parts]
-    total, square = sum(own, np.zeros(())), sum((v**2 for v in own), np.zeros(()))
-    for i, first in enumerate(quantity.parts):
-        for j in range(i):
-            mixed = (image.variance_of(first + quantity.parts[j]) - own[i] - own[j]) / 2
-            square = square + 2 * mixed**2
-    return total, square
-
-
-def set_angles(planes: Planes) -> None:
-    """Fieller's interval for the direction of a vector: all directions where it may be zero."""
-    for name in ANGLES:
-        if name not in planes:
-            continue
-        either = name == EITHER_AXIS
-        halves = directions(np.deg2rad(2 * planes[f"{name}_errors"].astype(float)), both_ends=either)
-        half_68, half_95 = (np.rad2deg(h) / 2 for h in halves)
-        value = planes[name]
-        _put(planes, name, value, half_68, value - half_95, value + half_95)
+def _set_angle(planes: Planes, name: str, vector: Array, covariance: Array) -> None:
+    """Fieller's interval for the direction of vectors (2, ...): all directions where they may be zero."""
+    found = directions(vector, covariance, both_ends=name == EITHER_AXIS)
+    half, low, high = (np.rad2deg(part) / 2 for part in found)
+    value = planes[name]
+    _put(planes, name, value, half, value + low, value + high)
 
 
 def set_ellipticity(planes: Planes) -> None:
@@ -149,12 +140,75 @@ def set_ellipticity(planes: Planes) -> None:
     linear, circular = planes["polarizance_linear"].astype(float), planes["polarizance_circular"].astype(float)
     # ElementNoise is taken off the linear part: else circular light has less ellipticity than 45 degrees.
     value = np.rad2deg(0.5 * np.arctan2(circular, linear))
-    halves = directions(np.deg2rad(2 * planes[f"{name}_errors"].astype(float)))
-    half_68, half_95 = (np.rad2deg(half) / 2 for half in halves)
+    square, zero = np.square(np.deg2rad(2 * planes[f"{name}_errors"].astype(float))), np.zeros(value.shape)
+    found = directions(np.stack([zero + 1, zero]), np.stack([square, square, zero]))
+    half_68, half_95 = (np.rad2deg(half) / 2 for half in (found.half, found.high))
     may_be_circular = planes["polarizance_linear_95"][0] == 0
     low = np.where(may_be_circular & (circular < 0), -45.0, np.maximum(value - half_95, -45.0))
     high = np.where(may_be_circular & (circular > 0), 45.0, np.minimum(value + half_95, 45.0))
     _put(planes, name, value, np.minimum(half_68, 45.0), low, high)
+
+
+def set_ratios(planes: Planes, derived: Mapping[str, Derived], image: ElementNoise, m00: Array) -> None:
+    """What the noise of m00 does to ratios beyond first order, after Fieller. All others are done.
+
+    With q = a/b to first order in all elements but b = m00, a - q0 b is normal for every q0, and its variance is that
+    of q, less twice the covariance of q and b times what q0 is off, plus the variance of b times that squared, over
+    b^2. Where m00 may be zero nothing is known.
+
+    Parameters
+    ----------
+    m00 : (rows, columns), counts.
+    """
+    of_m00 = image.covariance()[..., 0].astype(float)
+    relative = np.where(m00 > 0, np.sqrt(of_m00[..., 0]) / m00, np.inf)
+    some = relative > UNEVEN
+    u, of_m00 = relative[some], of_m00[some] / m00[some][:, None]
+    for name, quantity in derived.items():
+        if name not in planes:
+            continue
+        value, error = planes[name], planes[f"{name}_errors"]
+        if f"{name}_95" not in planes and has_own_95(name):
+            planes[f"{name}_95"] = np.stack([value - NORMAL_95 * error, value + NORMAL_95 * error])
+        if not some.any():
+            continue
+        own = value[..., some].astype(float)
+        bent, shared = u, np.nan_to_num(np.einsum("...pk,pk->...p", quantity.gradient[..., some, :], of_m00))
+        if name.endswith("_deg"):
+            # No ratio to m00.
+            bent, shared = np.zeros_like(u), np.zeros_like(shared)
+        low, high = _range(name, own)
+        half = np.max(np.abs(_over(np.stack([-error[..., some], error[..., some]]), bent, shared, 1.0)), axis=0)
+        everything = np.where(np.isfinite(own), np.maximum(own - low, high - own), high - low)
+        error[..., some] = np.where(u < 1 / SEEN, half, everything)
+        if has_own_95(name):
+            bounds = planes[f"{name}_95"]
+            ends = bounds[..., some]
+            wide = own + _over(ends - own, bent, shared, NORMAL_95)
+            # The end of a range stays.
+            kept = (ends == 0) | (ends == low) | (ends == high) | ~np.isfinite(ends) | ~np.isfinite(own)
+            bounds[..., some] = np.where(u < 1 / SEEN, np.where(kept, ends, wide), np.stack([low, high]))
+
+
+def _over(sides: Array, u: Array, shared: Array, deviate: float) -> Array:
+    """Ends (2, ...) of an interval from its middle, of a ratio to m00 with the relative error u."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        known = 1 - np.square(deviate * u)
+        # Beyond where first order holds the gradient may be anything, but no covariance is larger than both errors.
+        most = deviate * u * np.abs(sides)
+        turn = np.clip(deviate**2 * shared, -most, most)
+        return np.asarray((np.sign(sides) * np.sqrt(turn**2 + sides**2 * known) - turn) / known)
+
+
+def _range(name: str, value: Array) -> tuple[Array, Array]:
+    """What a quantity can be, (...) each; of an angle all of its period about the value."""
+    if name in ANGLES:
+        half = 45.0 if name == EITHER_AXIS else 90.0
+        middle = np.where(np.isfinite(value), value, half)
+        return middle - half, middle + half
+    low, high = next((np.array(ends) for end, ends in RANGES if name.endswith(end)), np.array([-np.inf, np.inf]))
+    grow = (slice(None),) * np.ndim(low) + (None,) * (value.ndim - np.ndim(low))
+    return np.broadcast_to(low[grow], value.shape), np.broadcast_to(high[grow], value.shape)
 
 
 def moves_of(systematic: Systematic, image: MuellerImage) -> Array:
@@ -213,7 +267,7 @@ def set_retardance(
 ) -> None:
     """Retardance also folds at 180 degrees, where fast and slow axis, right and left, are one.
 
-    Where the rotation is not determined, the intervals hold every retarder. `set_magnitudes` and `set_angles` are done.
+    Where the rotation is not determined, the intervals hold every retarder. `set_magnitudes` is done.
 
     Parameters
     ----------
@@ -305,10 +359,11 @@ def set_differential(planes: Planes, is_determined: NDArray[np.bool_]) -> None:
         _put(planes, name, value, half, *ends)
 
 
-def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0) -> None:
+def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0) -> Array:
     """Noise taken off eigenvalues, which it pushes apart, and off what follows from them.
 
-    xi0 is that of `process xi0`. The others keep their mean; their gaps say how far noise has pushed them.
+    xi0 is that of `process xi0`. The others keep their mean; their gaps say how far noise has pushed them. Returns the
+    eigenvalues (4, ...) whose deviations from that mean have lost what noise adds to their sum of squares.
     """
     xi, errors = planes["coherency_eigenvalues"].astype(float), planes["coherency_eigenvalues_errors"].astype(float)
     deviation = planes["eigenvalue_deviation"].astype(float)
@@ -321,7 +376,6 @@ def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0)
     apart = np.clip(np.stack([gaps[0], gaps.min(axis=0), gaps[1]]) / (APART * unit), 0, 1)
     mixed, mean = unit * (1 - apart), (1 - found.xi0) / 3
     shrunk = np.stack([found.xi0, *(mean + real * deviation)])
-    spread = np.stack([found.stderr, *np.hypot(errors[1:], mixed)])
     # The table is of even noise; noise that differs between the processes scales its intervals. No theory gives these
     # factors: docs/error-bars.md has what they cover.
     own = errors[1:] / (np.sqrt(0.75) * unit)
@@ -351,33 +405,43 @@ def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0)
     planes["td_missed_noise"] = (missed * np.sqrt(noise.others / observed)).astype(np.float32)
     planes["td_missed"] = (missed * real).astype(np.float32)
     planes["td_missed_errors"] = np.hypot(planes["td_missed_errors"], mixed.max(axis=0)).astype(np.float32)
-    _set_entropy(planes, shrunk, spread, found)
+    return shrunk
 
 
-def _set_entropy(planes: Planes, xi: Array, errors: Array, found: CorrectedXi0) -> None:
-    """Entropy of eigenvalues (4, ...) whose deviations have lost what noise adds."""
+def set_entropy(planes: Planes, xi: Array, found: CorrectedXi0) -> None:
+    """Entropy of eigenvalues (4, ...) whose deviations have lost what noise adds. `set_magnitudes` is done.
+
+    It is bent where an eigenvalue may be zero, and where all may be equal. There it follows what is known: of a nearly
+    pure sample xi0, the others in proportion; of a depolarizer the depolarization index, all eigenvalues in proportion.
+    """
+    own = entropy_of(xi)
+    spread = planes["entropy_errors"].astype(float)
+    errors = np.concatenate([found.stderr[None], planes["coherency_eigenvalues_errors"][1:]])
+    index, u = planes["depolarization_index"].astype(float), planes["depolarization_index_errors"].astype(float)
+    bent = (xi < SEEN * errors).any(axis=0) | (index < FLAT * u) | ~np.isfinite(spread)
+    rest, off = np.clip(xi[1:], 0, None), xi - 0.25
+    sums = rest.sum(axis=0)
+    rest = np.where(sums > 0, rest / np.where(sums > 0, sums, 1), 1 / 3)
+    scale = np.sqrt(4 / 3 * np.square(off).sum(axis=0))
+    share = np.clip((1 - found.xi0 - PURE[0]) / (PURE[1] - PURE[0]), 0, 1)
+    both = (found.interval_68, np.stack([index - u, index + u])), (found.interval_95, planes["depolarization_index_95"])
+    ends = []
+    for (of_xi0, of_index), deviate, level in zip(both, (1.0, NORMAL_95), (0, 1), strict=True):
+        unit = (of_xi0[1] - of_xi0[0]) / (2 * deviate)
+        observed = (1 - found.xi0) / unit
+        lost = np.where(observed < 4, positive(observed)[level] * unit, 1 - of_xi0[::-1])
+        pure = [entropy_of(np.concatenate([1 - p[None], p * rest])) for p in np.clip(lost, 0, 0.75)]
+        even = [entropy_of(0.25 + off * (np.maximum(x, 0) / scale)) for x in of_index[::-1]]
+        known = own - deviate * spread, own + deviate * spread
+        ends += [np.where(bent, (1 - share) * p + share * e, k) for p, e, k in zip(pure, even, known, strict=True)]
+    low, high, low_95, high_95 = ends
+    _put(planes, "entropy", (low + high) / 2, (high - low) / 2, np.maximum(low_95, 0), np.minimum(high_95, 1))
+
+
+def entropy_of(xi: Array) -> Array:
+    """Entropy (...) of eigenvalues (4, ...), without negative ones."""
     physical = np.clip(xi, 0, None)
-    physical /= physical.sum(axis=0)
-    # At an eigenvalue of zero the logarithm has no slope; within three errors of it that of one error is taken.
-    slopes = (np.log(np.maximum(np.maximum(xi, errors), 1e-12)) + 1) / np.log(4)
-    widest = np.sqrt(np.sum(np.square(slopes * errors), axis=0))
-    edge = (xi < SEEN * errors).any(axis=0)
-    planes["entropy"] = entropy(np.moveaxis(physical, 0, -1)).astype(np.float32)
-    spread = np.where(edge, widest, planes["entropy_errors"])
-    half = NORMAL_95 * spread
-    # There it bends by more than that: as far as xi0 reaches, the others in proportion.
-    rest = np.nan_to_num(physical[1:] / physical[1:].sum(axis=0), nan=1 / 3)
-    least, most = (entropy_of(np.clip(end, 0.25, 1.0), rest) for end in found.interval_95[::-1])
-    value = planes["entropy"].astype(float)
-    low, high = (
-        np.where(edge, f(v, e), v) for f, v, e in ((np.fmin, value - half, least), (np.fmax, value + half, most))
-    )
-    _put(planes, "entropy", value, spread, np.maximum(low, 0.0), np.minimum(high, 1.0))
-
-
-def entropy_of(xi0: Array, rest: Array) -> Array:
-    """Entropy (...) of eigenvalues: the largest is xi0, the others share what it leaves as `rest` (3, ...)."""
-    return np.asarray(entropy(np.moveaxis(np.concatenate([xi0[None], (1 - xi0) * rest]), 0, -1)))
+    return np.asarray(entropy(np.moveaxis(physical / physical.sum(axis=0), 0, -1)))
 
 
 def set_symmetric(planes: Planes, relative: Array) -> None:

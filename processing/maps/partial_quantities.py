@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import BoolArray
-from processing.maps.intervals import set_angles, set_ellipticity, set_magnitudes, set_systematic
+from processing.maps.intervals import set_ellipticity, set_magnitudes, set_ratios, set_systematic
 from processing.polarization import gradients
 from processing.polarization.quantities import POLARIZATIONS, NamedStokes
 from processing.storage.products.images import MuellerImage
@@ -65,8 +65,8 @@ def partial_block(
             found[name] = derived[name].value.astype(np.float32)
             found[f"{name}_errors"] = np.sqrt(image.variance_of(derived[name].gradient)).astype(np.float32)
         set_magnitudes(found, derived, m, image)
-        set_angles(found)
         set_ellipticity(found)
+        set_ratios(found, derived, image, m[..., 0, 0])
         if moves is not None:
             moved = set_systematic(found, {name: derived[name] for name in names}, moves)
             if by_input is not None:

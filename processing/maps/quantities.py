@@ -17,12 +17,13 @@ from processing.maps.intervals import (
     SEEN,
     has_own_95,
     moves_of,
-    set_angles,
     set_any_dominant,
     set_depolarization_power,
     set_differential,
     set_eigenvalues,
+    set_entropy,
     set_magnitudes,
+    set_ratios,
     set_retardance,
     set_symmetric,
     set_systematic,
@@ -40,6 +41,7 @@ from processing.polarization.eigenvalue_noise import corrected
 from processing.polarization.propagation import Derived
 from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.scalar_files import scalar_quantities
+from processing.polarization.vector_noise import of_slopes
 from processing.reduction.mueller import Progress
 from processing.reduction.systematic import INPUTS, Systematic
 from processing.storage.products.images import MuellerImage, require_all_elements, seen_elements
@@ -222,7 +224,7 @@ def quantities_block(
             each = gradient.reshape(-1, *m.shape[:2], 16)
             errors = [np.sqrt(image.variance_of(g)) for g in each]
             found[f"{name}_errors"] = np.stack(errors).reshape(value.shape).astype(np.float32)
-        found["retardance_vector_covariance"] = _covariance(image, derived["retardance_vector_deg"].gradient)
+        found["retardance_vector_covariance"] = _packed(image, derived["retardance_vector_deg"])
         polar = lu_chipman(m)
         _set_intervals(found, derived, m, image, depolarizer=polar.depolarizer)
         if moves is not None:
@@ -257,12 +259,13 @@ def _set_intervals(
         noise = coherency_noise(image)
         found["valid"] &= is_valid(image, noise)
         xi = np.moveaxis(found["coherency_eigenvalues"], 0, -1).astype(float)
-        set_eigenvalues(found, noise, corrected(xi, noise, image.covariance_of_depolarizer()))
+        xi0 = corrected(xi, noise, image.covariance_of_depolarizer())
+        shrunk = set_eigenvalues(found, noise, xi0)
         factor = widen_dominant(found, noise)
     set_magnitudes(found, derived, m, image, widened=factor)
-    set_angles(found)
     if isinstance(image, MuellerImage):
         set_any_dominant(found, derived, np.isfinite(factor))
+        set_entropy(found, shrunk, xi0)
     weakest = np.abs(_symmetric_eigenvalues(np.nan_to_num(depolarizer[..., 1:, 1:]))).min(axis=0)
     # What is left of the light after the diattenuator carries the noise of all of it.
     passed = 1 - np.square(np.asarray(derived["diattenuation"].value) + diattenuation_error)
@@ -273,6 +276,7 @@ def _set_intervals(
         set_differential(found, is_determined & _is_principal(found))
     if "symmetric_d1" in found:
         set_symmetric(found, _relative_error(image))
+    set_ratios(found, derived, image, m[..., 0, 0])
 
 
 def _is_principal(found: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
@@ -295,11 +299,10 @@ def _symmetric_eigenvalues(a: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.stack([mean + 2 * size * np.cos(turn + 2 * np.pi * k / 3) for k in range(3)])
 
 
-def _covariance(image: MuellerImage | ExtrapolatedImage, gradient: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Covariance (6, rows, columns) of 3 quantities with gradients (3, rows, columns, 16): 00, 11, 22, 01, 02, 12."""
-    own = [image.variance_of(g) for g in gradient]
-    mixed = [(image.variance_of(gradient[i] + gradient[j]) - own[i] - own[j]) / 2 for i, j in ((0, 1), (0, 2), (1, 2))]
-    return np.stack([*own, *mixed]).astype(np.float32)
+def _packed(image: MuellerImage | ExtrapolatedImage, vector: Derived) -> NDArray[np.float32]:
+    """Covariance (6, rows, columns) of a vector of three components: 00, 11, 22, 01, 02, 12."""
+    packed = of_slopes(image.covariance(), vector.value, vector.gradient).packed
+    return packed[[0, 1, 2, 3, 5, 4]].astype(np.float32)
 
 
 def _relative_error(image: MuellerImage | ExtrapolatedImage) -> NDArray[np.float64]:

@@ -94,8 +94,9 @@ def _parts(name: str, v: RealArray, slope: RealArray, elements: tuple[int, ...] 
     with np.errstate(divide="ignore", invalid="ignore"):
         along = (v1 * slope[0] + v2 * slope[1]) / linear[..., None]
         across = np.rad2deg(0.5) * (v1 * slope[1] - v2 * slope[0]) / linear[..., None] ** 2
+    parts = None if elements else Derived(np.moveaxis(v[..., :2], -1, 0), slope[:2])
     return {
-        f"{name}_linear": Derived(linear, along, elements, None if elements else slope[:2]),
+        f"{name}_linear": Derived(linear, along, elements, parts),
         f"{name}_circular": Derived(v[..., 2], slope[2]),
         f"{name}_orientation_deg": Derived(np.rad2deg(quantities.orientation(v)), across),
     }
@@ -139,7 +140,7 @@ def lu_chipman_quantities(m: RealArray) -> dict[str, Derived]:
     parts = [found.pop(name) for name in axes]
     vector = Derived(np.stack([p.value for p in parts]), np.stack([p.gradient for p in parts]))
     for name, count in (("retardance_deg", 3), ("retardance_linear_deg", 2)):
-        found[name] = found[name]._replace(parts=vector.gradient[:count])
+        found[name] = found[name]._replace(parts=Derived(vector.value[:count], vector.gradient[:count]))
     fast = found["retardance_fast_axis_deg"]
     either = Derived(np.mod(fast.value, 90.0), fast.gradient)
     return found | {"retardance_axis_or_90_deg": either, "retardance_vector_deg": vector}
@@ -181,10 +182,11 @@ def differential_quantities(m: RealArray) -> dict[str, Derived]:
     vector = _parts("", retardance, slope[:3])
     linear, circular, axis = vector["_linear"], vector["_circular"], vector["_orientation_deg"]
     to_deg = np.rad2deg(1.0)
+    values, slopes = to_deg * np.moveaxis(retardance, -1, 0), to_deg * slope[:3]
     return {
-        "differential_retardance_deg": Derived(to_deg * size, to_deg * whole, parts=to_deg * slope[:3]),
+        "differential_retardance_deg": Derived(to_deg * size, to_deg * whole, parts=Derived(values, slopes)),
         "differential_retardance_linear_deg": Derived(
-            to_deg * linear.value, to_deg * linear.gradient, parts=to_deg * slope[:2]
+            to_deg * linear.value, to_deg * linear.gradient, parts=Derived(values[:2], slopes[:2])
         ),
         "differential_retardance_fast_axis_deg": axis,
         "differential_retardance_circular_deg": Derived(to_deg * circular.value, to_deg * circular.gradient),

@@ -19,13 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.computing.compiling import njit
+from processing.computing.threads import for_ranges
+from processing.polarization.vector_kernels import DEVIATES, lengths
 
 LEVELS = (0.68268949, 0.95)
 #: Error at least, in units of the noise: an observed length far below what noise alone makes allows hardly any length.
 LEAST = 0.55
 #: Half the 95 % interval of a normal distribution, in standard deviations.
-NORMAL_95 = 1.959964
+NORMAL_95 = DEVIATES[1]
 #: Nodes of the table; `ALONG` is over sqrt(components).
 COMPONENTS = np.array([1, 1.25, 1.5, 1.75, 2, 2.5, 3, 3.5, 4, 5, 6, 7.5, 9, 11, 13, 15, 18.0])
 ALONG = np.array([0.1, 0.2, 0.3, 0.45, 0.6, 0.72, 0.85, 1.0])
@@ -49,7 +50,9 @@ class Interval(NamedTuple):
     high: Array
 
 
-def interval(length: Array, along: Array, total: Array, square: Array) -> Interval:
+def interval(
+    length: Array, along: Array, total: Array, square: Array, *, below: Array | None = None, above: Array | None = None
+) -> Interval:
     """Interval of the true length of vectors.
 
     Parameters
@@ -57,6 +60,8 @@ def interval(length: Array, along: Array, total: Array, square: Array) -> Interv
     length : (...), observed.
     along : (...), variance along the vector.
     total, square : (...), tr C and tr C^2.
+    below, above : (...), variances that stand for `along` at the bounds of the 95 % interval, where the true vector has
+        another direction; infinite where it may be zero.
 
     Examples
     --------
@@ -66,29 +71,13 @@ def interval(length: Array, along: Array, total: Array, square: Array) -> Interv
     >>> [bool(low == 0) for low in found.low]
     [True, False]
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        unit = np.sqrt(square / total)
-        components, share = total**2 / square, along / unit**2
-        seen = length / unit
-        # A length over a negative m00 is none.
-        known = np.isfinite(seen) & (seen >= 0) & np.isfinite(components) & np.isfinite(share)
-        at = np.stack(
-            [
-                np.interp(np.where(known, components, 1.0), COMPONENTS, np.arange(len(COMPONENTS))),
-                np.interp(np.where(known, share / np.sqrt(components), 1.0), ALONG, np.arange(len(ALONG))),
-                np.where(known, seen, 0.0) / (OBSERVED[1] - OBSERVED[0]),
-            ]
-        )
-        near = _near(_table()[0], at)
-        # Far from zero: noise across adds its square, and its scatter.
-        far = np.sqrt(np.maximum(seen**2 - components + share, 1.0))
-        spread = np.sqrt(share + np.maximum(components - share**2, 0) / (2 * far**2))
-        beyond = [far, spread, far - NORMAL_95 * spread, far + NORMAL_95 * spread]
-        out = [
-            np.where(known, np.where(seen < OBSERVED[-1], a, b) * unit, np.nan)
-            for a, b in zip(near, beyond, strict=True)
-        ]
-    return Interval(*out)
+    below, above = (along if part is None else part for part in (below, above))
+    flat = np.stack([length, along, total, square, below, above]).reshape(6, -1)
+    out = np.empty((4, length.size))
+    table, nodes = _table()[0], (COMPONENTS, ALONG, OBSERVED)
+    for_ranges(length.size, lambda start, stop: lengths(table, nodes, flat, out, start, stop))
+    out[1] = np.maximum(out[1], LEAST * np.sqrt(flat[3] / flat[2]))
+    return Interval(*out.reshape(4, *length.shape))
 
 
 @cache
@@ -107,57 +96,92 @@ def _with_ends(bounds: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.concatenate([bounds, np.broadcast_to(end, low.shape)[None]]).astype(float)
 
 
-def _near(table: NDArray[np.float64], at: Array) -> list[Array]:
-    """Value, error, bounds at 95 %, interpolated at nodes (coordinates, ...); a line is a table of one by one."""
-    cube = table if table.ndim == 4 else table[:, None, None]
-    places = np.ascontiguousarray(at.reshape(len(at), -1))
-    if len(places) == 1:
-        places = np.concatenate([np.zeros((2, places.shape[1])), places])
-    found = np.empty((5, places.shape[1]))
-    interpolate(np.ascontiguousarray(np.moveaxis(cube, 0, -1)), places, found)
-    low, high, low_95, high_95, end = found.reshape(5, *at.shape[1:])
-    # Of an upper limit alone the value goes to zero with what is observed.
-    value = np.where(low > 0, (low + high) / 2, np.minimum(high**2 / end, high) / 2)
-    return [value, np.maximum(high - value, LEAST), np.maximum(low_95, 0), high_95]
-
-
-@njit(cache=True, nogil=True)
-def interpolate(table, places, out):  # type: ignore[no-untyped-def]
-    """Linear interpolation of all planes of a table (n, m, k, planes) at `places` (3, pixels); beyond it the last."""
-    last = (table.shape[0] - 1, table.shape[1] - 1, table.shape[2] - 1)
-    for p in range(places.shape[1]):
-        x, y, z = min(places[0, p], last[0]), min(places[1, p], last[1]), min(places[2, p], last[2])
-        i, j, k = int(x), int(y), int(z)
-        x, y, z = x - i, y - j, z - k
-        i1, j1, k1 = min(i + 1, last[0]), min(j + 1, last[1]), min(k + 1, last[2])
-        for n in range(table.shape[3]):
-            a = (1 - z) * table[i, j, k, n] + z * table[i, j, k1, n]
-            b = (1 - z) * table[i, j1, k, n] + z * table[i, j1, k1, n]
-            c = (1 - z) * table[i1, j, k, n] + z * table[i1, j, k1, n]
-            d = (1 - z) * table[i1, j1, k, n] + z * table[i1, j1, k1, n]
-            out[n, p] = (1 - x) * ((1 - y) * a + y * b) + x * ((1 - y) * c + y * d)
-
-
-#: Error over length from which on the 68 and 95 % interval of a direction holds every direction. At 1 and 1/1.96 they
+#: Length over error up to which the 68 and 95 % interval of a direction holds every direction. With 1 and 1.96 they
 #: would cover 54 to 68 and 90 to 95 % (shortest vectors first), as the opposite direction is left out of them.
-ANY_DIRECTION = (1 / 1.4, 1 / 2.4)
+ANY_DIRECTION = (1.4, 2.4)
 
 
-def directions(ratio: Array, both_ends: bool = False) -> tuple[Array, Array]:
-    """Half widths (...), radians, of the 68 and 95 % interval of the direction of a vector in a plane, after Fieller.
+class Directions(NamedTuple):
+    """Of vectors in a plane, in radians: half the 68 % interval, and the ends of the 95 % interval, from the vector.
 
-    A direction is rejected where the vector's component across it is beyond its error, which is exact at any length.
+    The 68 % interval is the smallest one about the vector that contains Fieller's.
+    """
+
+    half: Array
+    low: Array
+    high: Array
+
+
+def directions(vector: Array, covariance: Array, both_ends: bool = False) -> Directions:
+    """Intervals of the directions of vectors (2, ...) with this covariance (3, ...), 00, 11, 01, after Fieller.
+
+    A direction is rejected where the vector's component across it is beyond its error, which is exact at any length and
+    for any covariance.
 
     Parameters
     ----------
-    ratio : (...), error across the vector over its length.
     both_ends : a direction and its opposite count as one.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> found = directions(np.array([[1.0, 10.0], [0.0, 0.0]]), np.array([[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]]))
+    >>> (found.high * 180 / np.pi).round(1).tolist()
+    [180.0, 11.3]
+    """
+    x, y = np.asarray(vector, dtype=float)
+    xx, yy, xy = np.asarray(covariance, dtype=float)
+    determinant = np.maximum(xx * yy - xy**2, 0.0)
+    across = np.maximum(x**2 * yy + y**2 * xx - 2 * x * y * xy, 0.0)
+    ends = []
+    for deviate, limit in zip((1.0, NORMAL_95), ANY_DIRECTION, strict=True):
+        a, d = x**2 - deviate**2 * xx, y**2 - deviate**2 * yy
+        p, q = (a - d) / 2, x * y - deviate**2 * xy
+        half = np.arctan2(deviate * np.sqrt(np.maximum(across - deviate**2 * determinant, 0.0)), (a + d) / 2) / 2
+        off = np.arctan2(q, p) / 2 - np.arctan2(y, x)
+        off -= np.pi * np.round(off / np.pi)
+        everything = across <= (deviate if both_ends else limit) ** 2 * determinant
+        whole = np.pi / 2 if both_ends else np.pi
+        ends.append([np.where(everything, side * whole, off + side * half) for side in (-1, 1)])
+    return Directions(np.maximum(-ends[0][0], ends[0][1]), *ends[1])
+
+
+#: Grid of `positive`: true and observed values, in standard errors.
+_TRUE, _SEEN = np.arange(0, 6, 0.05), np.arange(-6, 12, 0.02)
+
+
+def positive(observed: Array) -> tuple[Array, Array]:
+    """Intervals (2, ...) at 68 and 95 % of a number that is not negative, observed with an error of 1, likewise.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> [ends.round(1).tolist() for ends in positive(np.array([-1.0, 5.0]))]
+    [[[0.0, 4.0], [0.3, 6.0]], [[0.0, 3.0], [0.8, 7.0]]]
     """
     out = []
-    for deviate, limit in zip((1.0, NORMAL_95), ANY_DIRECTION, strict=True):
-        half = np.arcsin(np.minimum(deviate * ratio, 1.0))
-        out.append(half if both_ends else np.where(ratio > limit, np.pi, half))
+    for (low, high), deviate in zip(_of_positive(), DEVIATES, strict=True):
+        ends = np.interp(observed, high, _TRUE, left=0.0), np.interp(observed, low, _TRUE)
+        far = observed > _TRUE[-1] - 2
+        out.append(np.stack([np.where(far, observed + s * deviate, e) for s, e in zip((-1, 1), ends, strict=True)]))
     return out[0], out[1]
+
+
+@cache
+def _of_positive() -> list[NDArray[np.float64]]:
+    """Least and largest observation (2, true values) that each true value accepts, at both levels."""
+    steps = _SEEN[1] - _SEEN[0]
+    off, best = _SEEN - _TRUE[:, None], np.minimum(_SEEN, 0.0)
+    order = np.argsort(off**2 - best**2, axis=1, kind="stable")
+    taken = np.cumsum(np.take_along_axis(np.exp(-(off**2) / 2), order, axis=1), axis=1) * steps / np.sqrt(2 * np.pi)
+    found = []
+    for level in LEVELS:
+        ends = []
+        for numbers, sums in zip(order, taken, strict=True):
+            kept = _SEEN[numbers[: np.searchsorted(sums, level) + 1]]
+            ends.append((kept.min(), kept.max()))
+        found.append(np.maximum.accumulate(np.array(ends).T, axis=1))
+    return found
 
 
 def sum_of_singular_values(observed: Array, unit: Array) -> Interval:
@@ -171,8 +195,9 @@ def sum_of_singular_values(observed: Array, unit: Array) -> Interval:
     with np.errstate(divide="ignore", invalid="ignore"):
         seen = observed / unit
         known = np.isfinite(seen) & (seen >= 0)
-        at = [np.where(known, seen, 0.0) / (SUMS[1] - SUMS[0])]
-        near = _near(_table()[1], np.stack(at))
+        low, high, low_95, high_95, end = (np.interp(seen, SUMS, line) for line in _table()[1])
+        value = np.where(low > 0, (low + high) / 2, np.minimum(high**2 / end, high) / 2)
+        near = [value, np.maximum(high - value, LEAST), np.maximum(low_95, 0), high_95]
         # Second order: noise shared by two singular values adds its square over their sum.
         far, spread = seen - 4.5 / np.maximum(seen, 1.0), np.sqrt(3.0)
         beyond = [far, np.full_like(far, spread), far - NORMAL_95 * spread, far + NORMAL_95 * spread]

@@ -27,8 +27,8 @@ class Derived(NamedTuple):
     """(..., pixels..., 16)"""
     elements: tuple[int, ...] = ()
     """Of the length of a vector of elements over m00: their numbers, row-major."""
-    parts: RealArray | None = None
-    """Of the length of another vector: gradients (n, pixels..., 16) of its components."""
+    parts: Derived | None = None
+    """Of the length of another vector: its components (n, pixels...)."""
 
 
 def numeric_gradient(

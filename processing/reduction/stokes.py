@@ -222,16 +222,15 @@ def linear_polarization(
         c00, c11, c22, c01, c02, c12 = covariance
         u, v = s1 / linear, s2 / linear
         along = u * u * c11 + v * v * c22 + 2 * u * v * c12
-        across = v * v * c11 + u * u * c22 - 2 * u * v * c12
         cross = u * c01 + v * c02
         dolp_variance = (along - 2 * dolp * cross + dolp**2 * c00) / s0**2
         own = ((c11 + c22) / s0**2, (c11**2 + c22**2 + 2 * c12**2) / s0**4)
         degree = interval(dolp, np.maximum(dolp_variance, 0.0), *own)
-        halves = [np.rad2deg(half) / 2 for half in directions(np.sqrt(np.maximum(across, 0.0)) / linear)]
+        half, low, high = (np.rad2deg(part) / 2 for part in directions(np.stack([s1, s2]), np.stack([c11, c22, c12])))
     angle = np.rad2deg(aolp)
     found = {"dolp": degree.value, "dolp_errors": degree.error, "dolp_95": np.stack([degree.low, degree.high])}
-    found |= {"aolp_deg": angle, "aolp_deg_errors": halves[0]}
-    return found | {"aolp_deg_95": np.stack([angle - halves[1], angle + halves[1]])}
+    found |= {"aolp_deg": angle, "aolp_deg_errors": half}
+    return found | {"aolp_deg_95": np.stack([angle + low, angle + high])}
 
 
 def _systematic(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> Systematic | None:

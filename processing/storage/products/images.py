@@ -174,7 +174,7 @@ class MuellerImage:
         variance += floor
         return np.asarray(np.maximum(variance, 0.5 * floor, out=variance))
 
-    def covariance(self) -> NDArray[np.float64]:
+    def covariance(self) -> NDArray[np.floating]:
         """Covariance (rows, columns, 16, 16) of the elements, counts^2, row-major order m00, m01, ... m33.
 
         Rebuilt from W, the noise model and the fitted intensities, then scaled so that its diagonal is `errors`
@@ -183,20 +183,22 @@ class MuellerImage:
         return self._covariance
 
     @cached_property
-    def _covariance(self) -> NDArray[np.float64]:
-        inverse, variance = self._inverse, self.intensity_variance
+    def _covariance(self) -> NDArray[np.floating]:
+        full: NDArray[np.floating]
         if self.facts["weighted"]:
-            normal = np.einsum("np,ni,nj->pij", 1 / variance, self.w, self.w, optimize=True)
+            normal = np.einsum("np,ni,nj->pij", 1 / self.intensity_variance, self.w, self.w, optimize=True)
             whole = int(self.facts.get("rank", 16)) == 16
             full = np.linalg.inv(normal) if whole else np.linalg.pinv(normal, rcond=SMALLEST**2, hermitian=True)
+            full = full + self.dark @ self.dark.T
         else:
-            full = np.einsum("np,in,jn->pij", variance, inverse, inverse, optimize=True)
-        full = full + self.dark @ self.dark.T
+            drive, variance = self._sources
+            full = (variance.T @ (drive[:, None] * drive).reshape(256, -1).T).reshape(-1, 16, 16)
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = self.errors.reshape(16, -1).T / np.sqrt(np.einsum("pii->pi", full))
         scale[:, ~self.seen] = 0.0
-        full *= scale[:, :, None] * scale[:, None, :]
-        return np.asarray(full.reshape(*self.mask.shape, 16, 16))
+        full *= scale[:, :, None]
+        full *= scale[:, None, :]
+        return full.reshape(*self.mask.shape, 16, 16)
 
     def covariance_of_depolarizer(self) -> NDArray[np.float64]:
         """Covariance (16, 16) of the elements of an ideal depolarizer, in any unit: the same for every pixel.
@@ -227,19 +229,6 @@ class MuellerImage:
         seen = drive.T @ g.T.astype(np.float32)
         found = np.einsum("np,np,np->p", seen, seen, variance)
         return np.asarray((found * self._told).reshape(self.mask.shape))
-
-    def moments_of(self, elements: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Traces (rows, columns) of C and of C^2, C being the covariance of these elements, row-major; counts^2, ^4."""
-        if self.facts["weighted"]:
-            part = self._covariance.reshape(-1, 16, 16)[:, elements][:, :, elements]
-            found = np.einsum("pii->p", part), np.einsum("pij,pij->p", part, part)
-        else:
-            drive, variance = self._sources
-            gram = drive[list(elements)].T @ drive[list(elements)]
-            told = self._told
-            square = np.einsum("np,np->p", (gram * gram) @ variance, variance)
-            found = np.diag(gram) @ variance * told, square * told**2
-        return found[0].reshape(self.mask.shape).astype(float), found[1].reshape(self.mask.shape).astype(float)
 
     def covariances_between(self, pairs: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
         """Covariances (pairs, pixels) of elements, given by their numbers in row-major order; counts^2."""

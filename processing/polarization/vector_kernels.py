@@ -1,0 +1,212 @@
+"""Compiled loops over pixels behind `vector_noise`, `magnitude` and `sorted_eigenvalues`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processing.computing.compiling import njit
+
+#: Of the 68 and 95 % interval.
+DEVIATES = (1.0, 1.959964)
+#: Newton's method: steps at most, and relative error at which it ends.
+_STEPS, _CLOSE = 6, 1e-3
+#: A variance that changes by less than this part is taken as it is.
+_ALIKE = 0.04
+
+_jit = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"})
+
+
+@_jit
+def elements(m, numbers, covariance, out, start, stop):  # type: ignore[no-untyped-def]
+    n = len(numbers)
+    c, v, by = np.empty((n, n), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    for p in range(start, stop):
+        scale = np.float32(1) / m[p, 0]
+        for i in range(n):
+            v[i] = m[p, numbers[i]] * scale
+            # Of m_i - v_i m00 / 2: with it the noise of m00 is two products.
+            by[i] = covariance[p, 0, numbers[i]] - np.float32(0.5) * v[i] * covariance[p, 0, 0]
+        scale *= scale
+        for i in range(n):
+            for j in range(i + 1):
+                c[i, j] = (covariance[p, numbers[i], numbers[j]] - v[j] * by[i] - v[i] * by[j]) * scale
+        _moments(c, v, out, p)
+
+
+@_jit
+def slopes(vector, by_element, covariance, out, start, stop):  # type: ignore[no-untyped-def]
+    n = len(by_element)
+    c, by = np.empty((n, n), np.float32), np.empty(16, np.float32)
+    for p in range(start, stop):
+        for i in range(n):
+            for k in range(16):
+                by[k] = 0
+                for a in range(16):
+                    by[k] += covariance[p, k, a] * by_element[i, p, a]
+            for j in range(i + 1):
+                c[i, j] = 0
+                for k in range(16):
+                    c[i, j] += by[k] * by_element[j, p, k]
+        _moments(c, vector[:, p], out, p)
+
+
+@_jit
+def _moments(c, v, out, p):  # type: ignore[no-untyped-def]
+    """`vector_noise.VectorNoise` of a vector v and its covariance, the lower half of which is filled."""
+    n = len(c)
+    by = np.empty(n, np.float32)
+    total, square, along, size = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+    for i in range(n):
+        for j in range(i):
+            c[j, i] = c[i, j]
+    for i in range(n):
+        total += c[i, i]
+        size += v[i] * v[i]
+        by[i] = 0
+        for j in range(n):
+            square += c[i, j] * c[i, j]
+            by[i] += c[i, j] * v[j]
+        along += by[i] * v[i]
+    along /= size
+    out[0, p], out[1, p], out[2, p] = along, total, square
+    turned, across = np.float32(0), np.float32(0)
+    for i in range(n):
+        by[i] -= along * v[i]
+        turned += by[i] * by[i]
+    # The direction to which noise along v turns it, and the noise along that.
+    if turned > 0:
+        for i in range(n):
+            for j in range(n):
+                across += by[i] * c[i, j] * by[j]
+        across /= turned
+    _reach(np.sqrt(size), along, np.sqrt(turned / size), across, out[3:5, p])
+    place = 5
+    for apart in range(3):
+        for i in range(3 - apart):
+            out[place, p] = c[i, i + apart] if i + apart < n else np.nan
+            place += 1
+
+
+@_jit
+def _reach(length, along, mixed, across, out):  # type: ignore[no-untyped-def]
+    """`below` and `above` of a vector (length, 0) of covariance ((along, mixed), (mixed, across))."""
+    half, centre = (along - across) / 2, (along + across) / 2
+    z = DEVIATES[1]
+    # By how much z errors along v turn it, and what the variance along it then is.
+    turn = z * mixed / (np.sqrt(along) * length)
+    if turn * (2 * mixed + turn * across) < _ALIKE * along:
+        out[0] = along if length * length > z * z * along else np.inf
+        out[1] = along
+        return
+    radius = np.sqrt(half * half + mixed * mixed)
+    first, second = centre + radius, max(centre - radius, 1e-6 * centre)
+    # Square of the component of v along the first axis.
+    one = length * length * (1 + half / radius) / 2
+    other = length * length - one
+    out[0] = _farthest(length, first, second, one, other, z, 1.0)
+    out[1] = _farthest(length, first, second, one, other, z, -1.0)
+
+
+@_jit
+def _farthest(length, first, second, one, other, z, side):  # type: ignore[no-untyped-def]
+    """By Newton's method on the multiplier t of mu = (1 + side t C)^-1 v, which is that far from v."""
+    low, high, t = 0.0, 1 / first, 0.0
+    if side > 0:
+        white = np.sqrt(one / first + other / second)
+        if white <= z:
+            return np.inf
+        # Where the asymptote of the function is zero: it lies below that, and is concave.
+        high = t = (one / first**2 + other / second**2) / white**3 / (1 / z - 1 / white)
+    a = b = 1.0
+    for _ in range(_STEPS):
+        a, b = 1 / (1 + side * t * first), 1 / (1 + side * t * second)
+        inverse = 1 / np.sqrt(first * one * a * a + second * other * b * b)
+        off = inverse - t / z
+        if abs(off) < _CLOSE * inverse:
+            break
+        slope = side * (first * first * one * a**3 + second * second * other * b**3) * inverse**3 - 1 / z
+        if off > 0:
+            low = t
+        else:
+            high = t
+        t -= off / slope
+        if not low <= t <= high:
+            t = (low + high) / 2
+    a, b = 1 / (1 + side * t * first), 1 / (1 + side * t * second)
+    off = (np.sqrt(one * a * a + other * b * b) - length) / z
+    return off * off
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def lengths(table, nodes, given, out, start, stop):  # type: ignore[no-untyped-def]
+    """`magnitude.Interval` (4, pixels) of length, along, total, square, below and above (6, pixels)."""
+    ends = np.empty(4)
+    step, farthest, last = nodes[2][1] - nodes[2][0], nodes[2][-1], len(nodes[2]) - 1
+    for p in range(start, stop):
+        length, along, total, square = given[0, p], given[1, p], given[2, p], given[3, p]
+        unit = np.sqrt(square / total)
+        components, seen = total * total / square, length / unit
+        # A length over a negative m00 is none.
+        if not (np.isfinite(seen) and seen >= 0 and np.isfinite(components) and np.isfinite(along)):
+            out[:, p] = np.nan
+            continue
+        i, x = _place(components, nodes[0])
+        k = min(int(seen / step), last - 1)
+        z = min(seen / step - k, 1.0)
+        # Far from zero: noise across adds its square, and its scatter.
+        far = np.sqrt(max(seen * seen - components + along / unit**2, 1.0))
+        j, y = 0, 0.0
+        for n in range(4):
+            # Those of the 68 % interval are along the vector itself.
+            share = given[1 if n < 2 else 2 + n, p] / unit**2
+            if np.isinf(share):
+                ends[n] = 0.0
+            elif seen < farthest:
+                j, y = _place(share / np.sqrt(components), nodes[1])
+                ends[n] = _at(table[n], i, x, j, y, k, z)
+            else:
+                spread = np.sqrt(share + max(components - share * share, 0.0) / (2 * far * far))
+                ends[n] = far + (2 * (n % 2) - 1) * DEVIATES[n // 2] * spread
+        low, high = ends[0], ends[1]
+        if low > 0:
+            value = (low + high) / 2
+        else:
+            # Of an upper limit alone the value goes to zero with what is observed.
+            value = min(high * high / _at(table[4], i, x, j, y, k, z), high) / 2
+        out[0, p], out[1, p] = value * unit, (high - value) * unit
+        out[2, p], out[3, p] = max(ends[2], 0.0) * unit, ends[3] * unit
+
+
+@njit(cache=True, nogil=True)
+def _place(value, nodes):  # type: ignore[no-untyped-def]
+    """Node below a value, and how far it is to the next: 0 to 1."""
+    i = 0
+    while i < len(nodes) - 2 and value >= nodes[i + 1]:
+        i += 1
+    return i, min(max((value - nodes[i]) / (nodes[i + 1] - nodes[i]), 0.0), 1.0)
+
+
+@njit(cache=True, nogil=True)
+def _at(table, i, x, j, y, k, z):  # type: ignore[no-untyped-def]
+    a = (1 - z) * table[i, j, k] + z * table[i, j, k + 1]
+    b = (1 - z) * table[i, j + 1, k] + z * table[i, j + 1, k + 1]
+    c = (1 - z) * table[i + 1, j, k] + z * table[i + 1, j, k + 1]
+    d = (1 - z) * table[i + 1, j + 1, k] + z * table[i + 1, j + 1, k + 1]
+    return (1 - x) * ((1 - y) * a + y * b) + x * ((1 - y) * c + y * d)
+
+
+@njit(cache=True, nogil=True)
+def interpolate(table, places, out):  # type: ignore[no-untyped-def]
+    """Linear interpolation of all planes of a table (n, m, k, planes) at `places` (3, pixels); beyond it the last."""
+    last = (table.shape[0] - 1, table.shape[1] - 1, table.shape[2] - 1)
+    for p in range(places.shape[1]):
+        x, y, z = min(places[0, p], last[0]), min(places[1, p], last[1]), min(places[2, p], last[2])
+        i, j, k = int(x), int(y), int(z)
+        x, y, z = x - i, y - j, z - k
+        i1, j1, k1 = min(i + 1, last[0]), min(j + 1, last[1]), min(k + 1, last[2])
+        for n in range(table.shape[3]):
+            a = (1 - z) * table[i, j, k, n] + z * table[i, j, k1, n]
+            b = (1 - z) * table[i, j1, k, n] + z * table[i, j1, k1, n]
+            c = (1 - z) * table[i1, j, k, n] + z * table[i1, j, k1, n]
+            d = (1 - z) * table[i1, j1, k, n] + z * table[i1, j1, k1, n]
+            out[n, p] = (1 - x) * ((1 - y) * a + y * b) + x * ((1 - y) * c + y * d)

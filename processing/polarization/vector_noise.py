@@ -1,0 +1,56 @@
+"""Noise of vectors that a Mueller matrix gives, from the covariance of its 16 elements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.arrays import Array, RealArray
+from processing.computing.threads import for_ranges
+from processing.polarization import vector_kernels as kernels
+
+
+class VectorNoise(NamedTuple):
+    """Of the covariance C of vectors v (...).
+
+    Attributes
+    ----------
+    along : variance along v.
+    total, square : tr C and tr C^2.
+    below, above : square of how far below and above |v| lengths reach within the ellipsoid of 1.96 errors about v, over
+        1.96^2: the variance along v, where noise is alike in all directions. `below` is infinite where v may be zero.
+    packed : (6, ...), of the first three components: 00, 11, 22, 01, 12, 02; NaN where there are fewer.
+    """
+
+    along: Array
+    total: Array
+    square: Array
+    below: Array
+    above: Array
+    packed: Array
+
+
+def of_elements(covariance: NDArray[np.floating], m: Array, elements: Sequence[int]) -> VectorNoise:
+    """Of elements over m00, from the covariance (..., 16, 16) of matrices (..., 4, 4)."""
+    flat = np.ascontiguousarray(m, dtype=np.float32).reshape(-1, 16)
+    numbers = np.asarray(elements)
+    return _each(covariance, m.shape[:-2], lambda *rest: kernels.elements(flat, numbers, *rest))
+
+
+def of_slopes(covariance: NDArray[np.floating], vector: RealArray, slopes: RealArray) -> VectorNoise:
+    """Of vectors (n, ...) with these gradients (n, ..., 16), likewise."""
+    values = np.ascontiguousarray(vector.reshape(len(vector), -1), dtype=np.float32)
+    by = np.ascontiguousarray(slopes.reshape(len(vector), -1, 16), dtype=np.float32)
+    return _each(covariance, vector.shape[1:], lambda *rest: kernels.slopes(values, by, *rest))
+
+
+def _each(covariance: NDArray[np.floating], shape: tuple[int, ...], loop: Callable[..., object]) -> VectorNoise:
+    each = np.ascontiguousarray(covariance, dtype=np.float32).reshape(-1, 16, 16)
+    out = np.empty((11, len(each)), np.float32)
+    for_ranges(len(each), lambda start, stop: loop(each, out, start, stop))
+    found = out.reshape(-1, *shape).astype(float)
+    along, total, square, below, above = found[:5]
+    return VectorNoise(along, total, square, below, above, found[5:])
