@@ -4,16 +4,17 @@ import numpy as np
 import pytest
 
 from benchmarks import instrument_chain as chain
+from benchmarks.emulated_instruments import BENCHES, OF_AIR, Bench, emulated_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.instrument.model import InstrumentModel
 from processing.yaml_file import dump_yaml
 
 
 def test_every_instrument_has_its_line(configs):
-    assert set(chain.BENCHES) == {path.stem for path in (configs / "instruments").glob("*.yaml")}
+    assert set(BENCHES) == {path.stem for path in (configs / "instruments").glob("*.yaml")}
 
 
-@pytest.mark.parametrize("name", chain.BENCHES)
+@pytest.mark.parametrize("name", BENCHES)
 def test_the_next_sample_is_measured_better_or_as_before(name, tmp_path):
     row = chain.emulated(name, tmp_path)
     assert row.written <= 1.01 * min(row.nominal, row.train)
@@ -48,9 +49,9 @@ def test_a_plate_of_fewer_states_of_air_is_nearer_too(public_files, tmp_path):
     assert row.written <= row.train < 0.0015
 
 
-@pytest.mark.parametrize("fault", chain.OF_AIR)
+@pytest.mark.parametrize("fault", OF_AIR)
 def test_a_fault_of_the_air_capture_alone_stays_there(fault, tmp_path):
-    row = chain.emulated("rgb950", tmp_path, 2, chain.OF_AIR[fault])
+    row = chain.emulated("rgb950", tmp_path, 2, OF_AIR[fault])
     assert row.written < 0.5 * row.nominal
 
 
@@ -65,6 +66,6 @@ def test_the_noise_of_a_dark_channel_is_no_tone_curve(gains, is_nominal, configs
     file = tmp_path / "stokes.yaml"
     file.write_text(dump_yaml(stated))
     random = np.random.default_rng(4)
-    air = chain.emulated_capture(true, chain.Bench({}, {}), np.eye(4), "air", file=file, random=random)
+    air = emulated_capture(true, Bench({}, {}), np.eye(4), "air", file=file, random=random)
     found = diagnose_captures([air], stated)[0].diagnosis
     assert "tone_curve" not in [effect.kind for effect in found.effects]

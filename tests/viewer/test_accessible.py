@@ -21,16 +21,22 @@ RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "be
 
 
 @pytest.fixture
-def pages(lab, drr_capture, client, diagnosed, monkeypatch, tmp_path):
+def campaign(lab, drr_capture):
+    """Address of the page of a campaign with one capture."""
+    (lab / "night").mkdir()
+    (lab / "night" / IDENTITY).write_text(json.dumps({"campaign": {}, "simulated": True}))
+    drr_capture("night/air.h5")
+    return "/campaign?folder=night"
+
+
+@pytest.fixture
+def pages(lab, drr_capture, client, campaign, diagnosed, monkeypatch, tmp_path):
     """Address of each page of a folder with captures, products, a campaign, regions, notes, a job and an alarm."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     alarms.give_alarm("bench", "acquire died. THE LIGHT IS NOT SHUT: no answer")
     one, two = drr_capture("one.h5", omega_deg=35.0), drr_capture("two.h5", seed_of_noise=2)
     products = [Reduction(one).make(), Reduction(two).make()]
     Quantities(products[0]).make()
-    (lab / "night").mkdir()
-    (lab / "night" / IDENTITY).write_text(json.dumps({"campaign": {}, "simulated": True}))
-    drr_capture("night/air.h5")
     (lab / "damaged.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
     here = {"origin": "http://127.0.0.1:8000"}
     place = {"x0": "2", "x1": "9", "y0": "3", "y1": "8"}
@@ -45,7 +51,7 @@ def pages(lab, drr_capture, client, diagnosed, monkeypatch, tmp_path):
         "mueller": "/product?file=one.mueller.h5#x=5&y=4",
         "quantities": "/product?file=one.quantities.h5#x=5&y=4",
         "compare": "/compare?a=one.mueller.h5&b=two.mueller.h5",
-        "campaign": "/campaign?folder=night",
+        "campaign": campaign,
         "stack": "/stack",
         "diagnosis": f"/diagnosis?name={diagnosed}",
         "report": f"/diagnosis-report?name={diagnosed}",
@@ -92,10 +98,9 @@ def test_no_page_has_a_finding_and_none_is_wider_than_its_window(pages, address,
     assert wrong == {}, wrong
 
 
-@pytest.mark.long
-def test_a_log_scrolls_by_keys(pages, address, browser):
+def test_a_log_scrolls_by_keys(campaign, address, browser):
     page = browser.new_page(viewport={"width": 1400, "height": 500})
-    page.goto(f"{address}{pages['campaign']}")
+    page.goto(f"{address}{campaign}")
     log = page.locator("#log")
     log.evaluate("node => { for (let k = 0; k < 99; k++) node.append(`line ${k}`, document.createElement('br')); }")
     log.focus()
