@@ -41,13 +41,16 @@ def apply_to(changes: Changes, model: InstrumentModel, applied: AppliedEffect) -
     if applied.kind not in effects:
         raise EffectError(f"effect {applied.kind!r} does not exist; there are: {', '.join(sorted(effects))}")
     effect, place = effects[applied.kind], applied.element or ""
-    # An axis that stands still in this capture is no place to search, but what was found elsewhere holds there too.
-    turned = {axis: np.arange(8.0) ** 2 for axis in model.axes}
-    anywhere = effect.places(model, Conditions.of(turned, changes.conditions.channels)) if turned else ()
-    if place not in anywhere and place not in effect.places(model, changes.conditions):
+    if place not in effect.places(model, changes.conditions) and not _acts_elsewhere(effect, place, model, changes):
         raise EffectError(f"effect {applied.kind!r} cannot act on {place!r} in instrument {model.name!r}")
     parameters = effect.parameters(model, changes.conditions, place)
     effect.apply(changes, model, place, _values(applied, effect, parameters))
+
+
+def _acts_elsewhere(effect: InstrumentEffect, place: str, model: InstrumentModel, changes: Changes) -> bool:
+    """Whether an axis that stands still in this capture would make it a place; what was found there holds here too."""
+    turned = {axis: np.arange(8.0) ** 2 for axis in model.axes}
+    return bool(turned) and place in effect.places(model, Conditions.of(turned, changes.conditions.channels))
 
 
 def _values(applied: AppliedEffect, effect: InstrumentEffect, parameters: tuple[Parameter, ...]) -> NDArray[np.float64]:
