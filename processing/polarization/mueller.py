@@ -24,20 +24,15 @@ _TO_MUELLER = 0.5 * np.einsum("aji,bkl->abikjl", PAULI, PAULI).reshape(16, 16)
 _TO_COHERENCY = np.linalg.inv(_TO_MUELLER)
 
 
-def _assemble(rows: list[list[Array]]) -> Array:
-    """Matrices (..., 4, 4) of elements of one shape (...)."""
-    out = np.empty((*np.shape(rows[1][1]), 4, 4))
-    for i, row in enumerate(rows):
-        for j, x in enumerate(row):
-            out[..., i, j] = x
-    return out
-
-
 def rotation(angle: ArrayLike) -> Array:
     """Mueller rotation R such that an element turned by `angle` is R(angle) M R(-angle)."""
     t = 2 * np.asarray(angle, dtype=float)
-    c, s, o, z = np.cos(t), np.sin(t), np.ones_like(t), np.zeros_like(t)
-    return _assemble([[o, z, z, z], [z, c, -s, z], [z, s, c, z], [z, z, z, o]])
+    c, s = np.cos(t), np.sin(t)
+    out = np.zeros((*t.shape, 4, 4))
+    out[..., 0, 0] = out[..., 3, 3] = 1.0
+    out[..., 1, 1] = out[..., 2, 2] = c
+    out[..., 1, 2], out[..., 2, 1] = -s, s
+    return out
 
 
 def retarder(azimuth: ArrayLike, retardance: ArrayLike, lost: ArrayLike = 0.0) -> Array:
@@ -46,35 +41,30 @@ def retarder(azimuth: ArrayLike, retardance: ArrayLike, lost: ArrayLike = 0.0) -
     `lost` : share of what the retardance acts on that is lost to the average over several retardances.
     """
     t = 2 * np.asarray(azimuth, dtype=float)
-    t, d, kept = np.broadcast_arrays(t, np.asarray(retardance, dtype=float), 1 - np.asarray(lost, dtype=float))
+    d, kept = np.asarray(retardance, dtype=float), 1 - np.asarray(lost, dtype=float)
     c, s, cd, sd = np.cos(t), np.sin(t), kept * np.cos(d), kept * np.sin(d)
-    o, z = np.ones_like(c), np.zeros_like(c)
-    return _assemble(
-        [
-            [o, z, z, z],
-            [z, c * c + s * s * cd, c * s * (1 - cd), -s * sd],
-            [z, c * s * (1 - cd), s * s + c * c * cd, c * sd],
-            [z, s * sd, -c * sd, cd],
-        ]
-    )
+    out = np.zeros((*np.broadcast_shapes(t.shape, cd.shape), 4, 4))
+    out[..., 0, 0] = 1.0
+    out[..., 1, 1], out[..., 2, 2], out[..., 3, 3] = c * c + s * s * cd, s * s + c * c * cd, cd
+    out[..., 1, 2] = out[..., 2, 1] = c * s * (1 - cd)
+    out[..., 1, 3], out[..., 3, 1] = -s * sd, s * sd
+    out[..., 2, 3], out[..., 3, 2] = c * sd, -c * sd
+    return out
 
 
 def diattenuator(azimuth: ArrayLike, t_max: ArrayLike, t_min: ArrayLike) -> Array:
     """Linear diattenuator that transmits `t_max` along `azimuth` and `t_min` across it (intensities)."""
     t = 2 * np.asarray(azimuth, dtype=float)
     hi, lo = np.asarray(t_max, dtype=float), np.asarray(t_min, dtype=float)
-    t, hi, lo = np.broadcast_arrays(t, hi, lo)
     c, s = np.cos(t), np.sin(t)
     a, b, g = (hi + lo) / 2, (hi - lo) / 2, np.sqrt(np.maximum(hi * lo, 0.0))
-    z = np.zeros_like(c)
-    return _assemble(
-        [
-            [a, b * c, b * s, z],
-            [b * c, a * c * c + g * s * s, (a - g) * c * s, z],
-            [b * s, (a - g) * c * s, a * s * s + g * c * c, z],
-            [z, z, z, g],
-        ]
-    )
+    out = np.zeros((*np.broadcast_shapes(t.shape, a.shape), 4, 4))
+    out[..., 0, 0], out[..., 3, 3] = a, g
+    out[..., 0, 1] = out[..., 1, 0] = b * c
+    out[..., 0, 2] = out[..., 2, 0] = b * s
+    out[..., 1, 1], out[..., 2, 2] = a * c * c + g * s * s, a * s * s + g * c * c
+    out[..., 1, 2] = out[..., 2, 1] = (a - g) * c * s
+    return out
 
 
 def polarizer(azimuth: ArrayLike, extinction: ArrayLike = 0.0, ellipticity: ArrayLike = 0.0) -> Array:
