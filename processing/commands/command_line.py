@@ -7,6 +7,7 @@ import gc
 import os
 import sys
 from collections.abc import Sequence
+from functools import cached_property
 from importlib.metadata import version
 from typing import Annotated, Any, NoReturn
 
@@ -68,10 +69,15 @@ def _rank(name: str) -> tuple[int, str]:
 class Application(typer.Typer):
     """Commands that tell a mistake of usage as every other one: what was given, and what is wanted."""
 
+    @cached_property
+    def _command(self) -> Any:
+        # Its options are read from the signatures of all functions, which takes as long as many a command.
+        return typer.main.get_command(self)
+
     def __call__(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Run on the process's own arguments, or on `args`; always ends in SystemExit."""
         try:
-            ended = super().__call__(*args, standalone_mode=False, **kwargs)
+            ended = self._command(*args, standalone_mode=False, **kwargs)
         except TyperException as error:
             typer.echo(_in_our_words(error), err=True)
             sys.exit(error.exit_code)
