@@ -165,7 +165,7 @@ def test_a_capture_of_named_states(
     assert dataset["lcr_V"].attrs["units"] == "V"
     with h5py.File(write_dataset(dataset, tmp_path / "again.h5")) as h5:
         assert h5["entry/instrument/lcr/value"].attrs["units"] == "V"
-    code, _, err = process("reduce", path, "--out", tmp_path / "stokes.h5")
+    code, _, err = process("reduce", path, "--out", tmp_path / "stokes.h5", "--no-figure")
     assert code == 0, err
     # Light of the unpolarized source, straight through; no voltage shows its part at 45 degrees.
     stokes = open_dataset(tmp_path / "stokes.h5")["mueller"].mean(("y", "x")).to_numpy()[:, 0]

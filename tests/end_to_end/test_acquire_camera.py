@@ -33,7 +33,7 @@ def run_process(*arguments: object) -> None:
 def assert_horizontal(path: Path) -> None:
     """Reduce a capture of horizontal light and look at what comes out."""
     out = path.with_suffix(".stokes.h5")
-    run_process("reduce", path, "--out", out)
+    run_process("reduce", path, "--out", out, "--no-figure")
     s0, s1, s2 = StokesImage.load(out).values[:, 4:-4, 4:-4]
     assert np.median(np.hypot(s1, s2) / s0) == pytest.approx(1.0, abs=0.02)
     assert np.max(np.abs(np.rad2deg(np.arctan2(s2, s1)) / 2)) < 3.0

@@ -39,7 +39,7 @@ def test_mueller_image_and_xi0_agree_with_the_scene(acquire, small_rig, configs:
     code, out, err = acquire("--omega", 35, "--rig", small_rig(), "--out", tmp_path)
     assert code == 0, err
     capture = taken(out)
-    process("reduce", capture)
+    process("reduce", capture, "--no-figure")
     image = MuellerImage.load(capture.with_suffix(".mueller.h5"))
     assert image.simulated
     rows, columns = image.mask.shape
@@ -50,7 +50,7 @@ def test_mueller_image_and_xi0_agree_with_the_scene(acquire, small_rig, configs:
     errors = np.moveaxis(image.errors, (0, 1), (-2, -1))[truth.mask]
     pulls = (found - scaled(found, expected)) / errors
     assert np.mean(pulls**2) == pytest.approx(1.0, abs=0.03)
-    process("xi0", capture)
+    process("xi0", capture, "--no-figure")
     with Product(capture.with_suffix(".xi0.h5")) as product:
         good = (product.get("valid") > 0) & truth.mask
         assert good.sum() > 0.8 * truth.mask.sum()
@@ -103,7 +103,7 @@ def test_known_samples(sample: str, omega: int, expected: np.ndarray, acquire, s
     code, out, err = acquire("--sample", sample, "--omega", omega, "--rig", small_rig(), "--out", tmp_path)
     assert code == 0, err
     capture = taken(out)
-    process("reduce", capture)
+    process("reduce", capture, "--no-figure")
     image = MuellerImage.load(capture.with_suffix(".mueller.h5"))
     good = image.mask == 0
     found, errors = image.matrices[good], np.moveaxis(image.errors, (0, 1), (-2, -1))[good]

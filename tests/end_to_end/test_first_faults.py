@@ -80,8 +80,8 @@ def check(case: Case, acquire, rig, configs, folder, capfd) -> None:
     said, new, again = folder / "said.json", folder / "new.yaml", folder / "again.h5"
     instrument = configs / "instruments/rgb950.yaml"
     run(diagnose_cli.main, capture, "--instrument", instrument, "--write", new, "--json", said)
-    run(process, "reduce", capture)
-    run(process, "reduce", capture, "--instrument", new, "--out", again)
+    run(process, "reduce", capture, "--no-figure")
+    run(process, "reduce", capture, "--instrument", new, "--out", again, "--no-figure")
     found = json.loads(said.read_text())
     names = {(e["kind"], *(n.partition("[")[0] for n in e["indistinguishable_from"])) for e in found["effects"]}
     sure = {e["kind"] for e in found["effects"] if e["answer"] == "sure" and e["confident"]}
@@ -91,7 +91,7 @@ def check(case: Case, acquire, rig, configs, folder, capfd) -> None:
     scene = Scene.load(configs / "scenes" / f"{case.sample}.yaml")
     for product in (capture.with_suffix(".mueller.h5"), again):
         xi0 = product.with_suffix(".xi0.h5")
-        run(process, "xi0", product, "--out", xi0)
+        run(process, "xi0", product, "--out", xi0, "--no-figure")
         errors.append(true_error(product, xi0, scene).mueller_rms)
     with capfd.disabled():
         shown = "; ".join(f"{'/'.join(equal)}{' (sure)' if equal[0] in sure else ''}" for equal in sorted(names))

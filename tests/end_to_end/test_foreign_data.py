@@ -257,7 +257,7 @@ def test_two_beams_on_one_sensor(tmp_path, process):
     assert code == 0, said
     with Capture(out) as capture:
         assert (capture.channel_names, capture.frame_shape) == (("o", "e"), (4, 6))
-    assert process("reduce", out)[0] == 0
+    assert process("reduce", out, "--no-figure")[0] == 0
     s = MuellerImage.load(out.with_suffix(".mueller.h5")).values[:, 0].mean(axis=(1, 2))
     assert s[:3] / s[0] == pytest.approx(light[:12:4], abs=2e-3)
 
@@ -290,14 +290,14 @@ def test_a_stokes_polarimeter_of_twelve_states(configs, tmp_path, process, kind)
     out = tmp_path / "sample.h5"
     instrument = ("--instrument", configs / "instruments" / "rotating_retarder_stokes.yaml")
     assert process("import", *given, *instrument, "--wavelength-nm", 532, "--out", out)[0] == 0
-    assert process("reduce", out)[0] == 0
+    assert process("reduce", out, "--no-figure")[0] == 0
     image = MuellerImage.load(out.with_suffix(".mueller.h5"))
     assert image.values[:, 0].mean(axis=(1, 2)) / image.values[0, 0].mean() == pytest.approx(SAMPLE[:, 0], abs=2e-3)
 
 
 def mueller_of(process, capture):
     """M / m00 of the whole image, by `process reduce`."""
-    assert process("reduce", capture)[0] == 0
+    assert process("reduce", capture, "--no-figure")[0] == 0
     m = MuellerImage.load(capture.with_suffix(".mueller.h5")).values.mean(axis=(2, 3))
     return m / m[0, 0]
 
@@ -314,7 +314,10 @@ def test_the_tutorial_of_an_own_polarimeter_corrects_its_matrix(tmp_path, proces
         with pytest.raises(SystemExit) as end:
             {"process": main, "diagnose": diagnose}[words[1]](words[2:])
         assert not end.value.code
-    assert process("reduce", "sample.h5", "--instrument", "my_polarimeter.yaml", "--out", "nominal.h5")[0] == 0
+    assert (
+        process("reduce", "sample.h5", "--instrument", "my_polarimeter.yaml", "--out", "nominal.h5", "--no-figure")[0]
+        == 0
+    )
     products = (tmp_path / "nominal.h5", *tmp_path.glob("sample.mueller*.h5"))
     matrices = [MuellerImage.load(path).values.mean(axis=(2, 3)) for path in products]
     nominal, corrected = (np.abs(m / m[0, 0] - scope["SAMPLE"]).max() for m in matrices)

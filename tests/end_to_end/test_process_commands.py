@@ -73,7 +73,7 @@ def test_import_reduce_figure(suffix: str, tmp_path: Path, instrument: Path, pro
     assert (tmp_path / "states.mueller.h5").stat().st_mtime_ns == written
     code, out, err = process("reduce", tmp_path / "states.h5", "--weighted")
     assert (code, "states.mueller.h5 exists" in err) == (2, True)
-    assert process("reduce", tmp_path / "states.h5", "--weighted", "--overwrite")[0] == 0
+    assert process("reduce", tmp_path / "states.h5", "--weighted", "--overwrite", "--no-figure")[0] == 0
 
 
 def test_calibrate_finds_a_wrong_train_and_never_overwrites(
@@ -186,7 +186,7 @@ def test_noise_options_of_reduce(measured: Measured, tmp_path: Path, instrument:
     assert "is not a product of `process`" in err
     noise = ["--gain-e-per-count", 0.5, "--read-noise-e", 2, "--overwrite"]
     assert process("import", "--states", measured.states, *options, *noise)[0] == 0
-    extra = ["--weighted", "--covariance", "--physical", "likelihood"]
+    extra = ["--weighted", "--covariance", "--physical", "likelihood", "--no-figure"]
     code, out, err = process("reduce", capture, *extra)
     assert (code, "the residual is only" in err) == (0, True)
     assert "weighted: yes" in out
@@ -219,7 +219,7 @@ def test_xi0_reduces_first_and_reuses_the_product(
         # A mirror has no depolarization; noise-free but for rounding, so every pixel is valid.
         assert np.all(product.get("valid") == 1)
         assert np.max(np.abs(product.get("xi0") - 1)) < 0.01
-    code, out, err = process("xi0", tmp_path / "states.h5", "--overwrite")
+    code, out, err = process("xi0", tmp_path / "states.h5", "--overwrite", "--no-figure")
     assert code == 0
     assert "using" in out
     code, out, err = process("xi0", tmp_path / "states.xi0.h5", "--out", tmp_path / "y.h5")

@@ -84,7 +84,7 @@ def test_all_maps_with_errors(process: Run, capture: Path, tmp_path: Path) -> No
             # Elements of the depolarizer that noise may have exchanged have no error bar.
             assert np.isfinite(product.get(f"{name}_errors")[lit]).mean() > 0.75
     # One sample has one median of xi0.
-    assert process("xi0", capture, "--out", tmp_path / "xi0.h5")[0] == 0
+    assert process("xi0", capture, "--out", tmp_path / "xi0.h5", "--no-figure")[0] == 0
     with Product(tmp_path / "xi0.h5") as product:
         assert product.facts["median_xi0"] == pytest.approx(median, abs=1e-6)
 
@@ -92,7 +92,7 @@ def test_all_maps_with_errors(process: Run, capture: Path, tmp_path: Path) -> No
 @pytest.mark.long
 def test_pairs_and_refusals(process: Run, capture: Path, tmp_path: Path) -> None:
     out = tmp_path / "q.h5"
-    code, _, err = process("quantities", capture, "--pair", "45,right", "--out", out)
+    code, _, err = process("quantities", capture, "--pair", "45,right", "--out", out, "--no-figure")
     assert code == 0, err
     with Product(out) as product:
         assert "45_to_right" in product.names
@@ -111,7 +111,7 @@ def test_pairs_and_refusals(process: Run, capture: Path, tmp_path: Path) -> None
 
 @pytest.mark.long
 def test_axostep_mueller_files(process: Run, capture: Path, tmp_path: Path) -> None:
-    assert process("reduce", capture)[0] == 0
+    assert process("reduce", capture, "--no-figure")[0] == 0
     product = capture.with_suffix(".mueller.h5")
     code, text, err = process("to-axostep", product)
     assert code == 0, err
@@ -128,7 +128,7 @@ def test_axostep_mueller_files(process: Run, capture: Path, tmp_path: Path) -> N
         np.testing.assert_array_equal(again.get("mueller"), values)
         assert np.isnan(again.get("mueller_errors")).all()
         assert again.header.omega_deg == 35
-    code, _, err = process("quantities", back, "--out", tmp_path / "q.h5")
+    code, _, err = process("quantities", back, "--out", tmp_path / "q.h5", "--no-figure")
     assert code == 0, err
     assert "holds no standard errors" in err
     # The same again is unchanged; another file of that name is not replaced.
