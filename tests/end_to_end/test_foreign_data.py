@@ -1,8 +1,5 @@
 """Data of four other labs, imported, reduced and compared with the truth that made them."""
 
-import re
-import runpy
-import shlex
 from pathlib import Path
 
 import cv2
@@ -11,8 +8,6 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from processing.commands.application import main
-from processing.commands.diagnose import main as diagnose
 from processing.instrument.elements import Diattenuator, Polarizer, Retarder
 from processing.instrument.measured import MeasuredMatrix
 from processing.instrument.model import Channel, InstrumentModel
@@ -300,29 +295,6 @@ def mueller_of(process, capture):
     assert process("reduce", capture, "--no-figure")[0] == 0
     m = MuellerImage.load(capture.with_suffix(".mueller.h5")).values.mean(axis=(2, 3))
     return m / m[0, 0]
-
-
-@pytest.mark.long
-def test_the_tutorial_of_an_own_polarimeter_corrects_its_matrix(tmp_path, process, monkeypatch):
-    scope = runpy.run_path(str(ROOT / "examples/other_lab.py"))
-    scope["write_folders"](tmp_path / "other_lab")
-    page = (ROOT / "docs/tutorial-your-own-polarimeter.md").read_text()
-    (tmp_path / "my_polarimeter.yaml").write_text(page.split('title="my_polarimeter.yaml"\n')[1].split("```")[0])
-    monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```bash\n(.*?)```", page.replace("\\\n", " "), re.DOTALL)
-    for words in map(shlex.split, blocks):
-        with pytest.raises(SystemExit) as end:
-            {"process": main, "diagnose": diagnose}[words[1]](words[2:])
-        assert not end.value.code
-    assert (
-        process("reduce", "sample.h5", "--instrument", "my_polarimeter.yaml", "--out", "nominal.h5", "--no-figure")[0]
-        == 0
-    )
-    products = (tmp_path / "nominal.h5", *tmp_path.glob("sample.mueller*.h5"))
-    matrices = [MuellerImage.load(path).values.mean(axis=(2, 3)) for path in products]
-    nominal, corrected = (np.abs(m / m[0, 0] - scope["SAMPLE"]).max() for m in matrices)
-    assert nominal > 0.015
-    assert corrected < 0.001
 
 
 def test_the_reference_of_instrument_files_names_every_field():
