@@ -32,7 +32,7 @@ class ReflectanceProblem:
     alone. `fold` (N,) is the part of each point that is held out.
     """
 
-    holds_out_states = far_from_linear = noise_known = False
+    holds_out_states = noise_known = False
     spread, folds, sigma = 1.0, FOLDS, 1.0
 
     def __init__(self, geometry, m, index, fold):

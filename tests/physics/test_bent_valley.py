@@ -17,7 +17,7 @@ from processing.effect import Effect, Parameter
 class Valley:
     """Each of two parts asks that y = x^2, and that x is 3 or -3."""
 
-    folds, noise_known, holds_out_states, far_from_linear, spread = 2, True, False, False, 1.0
+    folds, noise_known, holds_out_states, spread = 2, True, False, 1.0
     wanted, steep = (3.0, -3.0), 3.0
 
     def sums(self, space: Space, values: np.ndarray, *, derivatives: bool = True) -> Sums:

@@ -10,7 +10,7 @@ from scipy.special import betaln
 from processing.diagnosis.search.averages import sample, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
-from processing.diagnosis.search.descent import descend
+from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import FEW_CAUSES, TAU, TAU_WEIGHT
@@ -173,8 +173,8 @@ def test_a_descent_stays_where_the_model_has_numbers():
             excess=np.array([excess]), freedom=np.array([10.0]), gradient=-5 * one, curvature=one[None], stretch=0 * one
         )
 
-    problem = SimpleNamespace(relinearize=lambda space, x: False, sums=sums)
-    assert descend(problem, space, np.zeros(1), np.zeros(1)) == 0.0
+    problem = SimpleNamespace(folds=1, relinearize=lambda space, x: False, sums=sums)
+    assert minimize(problem, space, np.zeros(1), weak=np.zeros(1)).values == 0.0
 
 
 def test_of_those_that_may_be_there_alone_never_two_are():

@@ -22,7 +22,7 @@ def effect_of(kind: str) -> Effect:
 class Bench:
     """Chi-square of values that act on the states alike in all pixels, a little bent, and of what nothing explains."""
 
-    folds, noise_known, holds_out_states, far_from_linear, spread = 1, True, False, False, 1.0
+    folds, noise_known, holds_out_states, spread = 1, True, False, 1.0
 
     def __init__(self, slopes: np.ndarray, bends: np.ndarray, truth: np.ndarray, unlisted: float) -> None:
         self.slopes, self.bends, self.truth, self.unlisted = slopes, bends, truth, unlisted

@@ -53,8 +53,6 @@ class InstrumentProblem:
     (`relinearize`), each a problem of its own, and the nearest one is asked (`near`).
     """
 
-    far_from_linear = False
-
     def __init__(
         self,
         models: InstrumentModel | Sequence[InstrumentModel],

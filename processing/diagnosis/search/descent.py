@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.diagnosis.search.averages import Samples, sample
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.rules import NOMINAL_TAU, SAMPLES_BEFORE, TAKES_PART
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
-from processing.diagnosis.search.space import Problem, Space, Sums
+from processing.diagnosis.search.space import Problem, Space
 
 #: [standard deviations] A move of the solution below which no new linearization is needed.
 SETTLED = 0.3
@@ -21,18 +22,8 @@ SETTLED = 0.3
 STEPS = 6
 #: [times] That everything is linearized anew before groups are chosen.
 EXPANSIONS = 8
-#: [chi-square] The descent ends when a step gains less than this.
-LEAST_GAIN = 0.05
-#: [of the chi-square] The same.
-LEAST_RELATIVE = 1e-7
 #: [typical sizes] Least width of a prior of values that are fitted.
 LEAST_WIDTH = 1e-3
-#: [steps] One after the other that may be refused.
-REFUSED = 8
-#: [1] By which a step that is refused is damped more, and one that is taken less.
-STIFFER = 10.0
-#: [of the curvature] Damping of a step that was refused without any.
-FIRST_DAMPING = 1e-3
 
 
 def all_at_once(
@@ -48,7 +39,8 @@ def all_at_once(
     for _ in range(EXPANSIONS):
         sums = problem.sums(part, values, derivatives=False)
         left = float(sums.excess.sum()) + (0.0 if problem.noise_known else float(sums.freedom.sum()))
-        new = descend(problem, part, values, noise.unit(left) / width**2, steps=3)
+        weak = noise.unit(left) / width**2
+        new = minimize(problem, part, values, steps=3, expansions=0, weak=weak).values
         moved, values = np.max(np.abs(new - values) / width), new
         if not problem.relinearize(part, values) and moved < SETTLED:
             break
@@ -91,9 +83,9 @@ def improved(
     out = np.where(space.fixed, starts[0], 0.0)
     if positions.size:
         places = [x[positions] for x in starts]
-        left = [_penalized(problem.sums(part, x, derivatives=False), weak, x) for x in places]
-        best = int(np.argmin(np.nan_to_num(left, nan=np.inf)))
-        out[positions] = descend(problem, part, places[best], weak, steps=steps)
+        left = [problem.sums(part, x, derivatives=False).excess.sum() + weak @ x**2 for x in places]
+        best = places[int(np.argmin(np.nan_to_num(left, nan=np.inf)))]
+        out[positions] = minimize(problem, part, best, steps=steps, expansions=0, weak=weak).values
     return out
 
 
@@ -108,7 +100,8 @@ def minimum_of(problem: Problem, space: Space, sets: Sets, state: State) -> Arra
     typical = space.joined("typical")
     out = np.zeros(space.size)
     weak = state.unit / (tau * typical)[positions] ** 2
-    out[positions] = descend(problem, part, (linear * typical)[positions], weak)
+    start = (linear * typical)[positions]
+    out[positions] = minimize(problem, part, start, steps=STEPS, expansions=0, weak=weak).values
     return out
 
 
@@ -117,39 +110,3 @@ def _part_of(space: Space, groups: Sequence[Group]) -> tuple[Space, NDArray[np.i
     index = {int(i) for g in groups for i in g.index}
     chosen = [k for k, part in enumerate(space.slices) if part.start in index]
     return Space(tuple(space.candidates[k] for k in chosen)), space.positions(chosen)
-
-
-def _penalized(sums: Sums, weak: Array, values: Array, reference: float | None = None) -> float:
-    """Chi-square over its stretch and prior, in units of noise that is `reference` as a whole."""
-    freedom = max(float(sums.freedom.sum()), 1e-300)
-    return float(sums.excess.sum() * (freedom if reference is None else reference) / freedom + weak @ values**2)
-
-
-def descend(problem: Problem, space: Space, x: Array, weak: Array, *, steps: int = STEPS) -> Array:
-    """Values at the minimum of chi-square over its stretch, plus weak . x^2, near x (Levenberg-Marquardt, bounds)."""
-    lower, upper = space.joined("lower"), space.joined("upper")
-    problem.relinearize(space, x)
-    sums = problem.sums(space, x)
-    reference, damping = float(sums.freedom.sum()), 0.0
-
-    least = _penalized(sums, weak, x, reference)
-    for step in range(steps):
-        sums = problem.sums(space, x) if step else sums
-        freedom = max(float(sums.freedom.sum()), 1e-300)
-        g = sums.gradient.sum(axis=0) - sums.excess.sum() / freedom * sums.stretch.sum(axis=0) + weak * x
-        h = sums.curvature.sum(axis=0) + np.diag(weak)
-        for _ in range(REFUSED):
-            move = np.linalg.solve(h + damping * np.diag(np.diag(h)), g)
-            tried = np.where(space.fixed, x, np.clip(x - move, lower, upper))
-            # Derivatives are most of the work; a step that is refused needs none.
-            now = _penalized(problem.sums(space, tried, derivatives=False), weak, tried, reference)
-            if now <= least:
-                break
-            damping = max(STIFFER * damping, FIRST_DAMPING)
-        # Also where the sum is no number: so far away that the model has no intensities.
-        if not now <= least:
-            break
-        gain, x, least, damping = least - now, tried, now, damping / STIFFER
-        if gain < LEAST_GAIN + LEAST_RELATIVE * abs(least):
-            break
-    return x

@@ -14,31 +14,22 @@ from processing.diagnosis.search.space import Problem, Space, Sums
 
 #: [of the degrees of freedom] That fitted values leave at least, where nothing is held out.
 LEAST_FREEDOM = 0.2
-
 #: [typical sizes] Width of the prior that keeps unseen parameters still.
 PRIOR_WIDTH = 10.0
 #: [steps] Of a fit.
 STEPS = 15
-#: [steps] Of a fit that what is held out is predicted by.
-MANY_STEPS = 30
-#: [of the excess] To which what is held out is predicted: a fit that ends earlier would still know it.
-HELD_OUT_RELATIVE = 1e-4
-#: [steps] Of such a fit where the model is far from linear.
-FEW_STEPS = 6
 #: [times] That corrections of counts are expanded anew in one fit.
 EXPANSIONS = 2
-#: [chi-square] The fit ends when a step promises less than this.
-LEAST_GAIN = 0.01
-#: [of the excess] The same.
+#: [chi-square] The fit ends when a step gains less than this.
+LEAST_GAIN = 0.05
+#: [of the chi-square] The same.
 LEAST_RELATIVE = 1e-7
+#: [of the excess] To which what is held out is predicted: a fit that ends earlier would still know it.
+HELD_OUT_RELATIVE = 1e-4
 #: [1] By which a step that is refused is damped more, and one that is taken less.
 STIFFER = 10.0
-#: [of the curvature] Damping of the first step.
-FIRST_DAMPING = 1e-6
-#: [of the curvature] Least damping of a step that is taken.
-LEAST_DAMPING = 1e-9
-#: [of the curvature] Least damping of a step that was refused.
-REFUSED_DAMPING = 1e-4
+#: [of the curvature] Damping of a step that was refused without any.
+FIRST_DAMPING = 1e-3
 #: [of the curvature] Damping beyond which there is no step.
 MOST_DAMPING = 1e6
 
@@ -74,71 +65,73 @@ def minimize(
     least_gain: float = LEAST_GAIN,
     weak: Array | None = None,
 ) -> Fit:
-    """Least squares by Levenberg-Marquardt with bounds, on the data of the folds given; `free` (K,) may hold some.
+    """Least chi-square over its stretch by Levenberg-Marquardt with bounds, on the data of the folds given.
 
-    It ends when a step gains less than `least_gain`. `weak` (K,) is the curvature of the prior; default: `prior`.
-    Corrections of counts are expanded about the start, and at most `expansions` times anew about where the fit ended.
+    It ends when a step gains less than `least_gain`. `weak` (K,) is the curvature of the prior; default: `prior`. Some
+    values may be held, others are `free` (K,). Corrections of counts are expanded about the start, and at most
+    `expansions` times anew about where the fit ended.
     """
-    if folds is None and expansions:
-        problem.relinearize(space, start)
     weak = prior(space) if weak is None else weak
-    fit = _descend(problem, space, start, folds, free=free, steps=steps, least_gain=least_gain, weak=weak)
-    if folds is None:
-        for _ in range(expansions):
-            if not problem.relinearize(space, fit.values):
-                break
-            fit = _descend(problem, space, fit.values, folds, free=free, steps=steps, least_gain=least_gain, weak=weak)
+    use = list(range(problem.folds) if folds is None else folds)
+    move = (np.ones(space.size, dtype=bool) if free is None else free) & ~space.fixed
+    fit = None
+    for _ in range(1 + (expansions if folds is None else 0)):
+        if folds is None and not problem.relinearize(space, start) and fit is not None:
+            break
+        fit = _descend(problem, space, start, use, free=move, steps=steps, least_gain=least_gain, weak=weak)
+        start = fit.values
+    assert fit is not None
     return fit
 
 
 def _descend(
     problem: Problem,
     space: Space,
-    start: Array,
-    folds: Sequence[int] | None,
+    x: Array,
+    use: Sequence[int],
     *,
-    free: NDArray[np.bool_] | None,
+    free: NDArray[np.bool_],
     steps: int,
     least_gain: float,
     weak: Array,
 ) -> Fit:
-    use = list(range(problem.folds) if folds is None else folds)
     lower, upper = space.joined("lower"), space.joined("upper")
-    free = (np.ones(space.size, dtype=bool) if free is None else free) & ~space.fixed
-    x = np.clip(start, lower, upper)
-    sums = problem.sums(space, x)
-    cost = sums.excess[use].sum() + weak @ x**2
-    damping = FIRST_DAMPING
+    x = np.clip(x, lower, upper)
+    sums, damping = problem.sums(space, x), 0.0
+    reference = float(sums.freedom[use].sum())
+    cost = _penalized(sums, weak, x, use, reference=reference)
     for _ in range(steps):
-        g = sums.gradient[use].sum(axis=0) + weak * x
+        # A bend of the response stretches residual and noise alike, which is no gain.
+        unit = sums.excess[use].sum() / max(float(sums.freedom[use].sum()), 1e-300)
+        g = sums.gradient[use].sum(axis=0) - unit * sums.stretch[use].sum(axis=0) + weak * x
         h = sums.curvature[use].sum(axis=0) + np.diag(weak)
         move = free & ~((x <= lower) & (g > 0)) & ~((x >= upper) & (g < 0))
-        if not move.any():
-            break
         gm, hm = g[move], h[np.ix_(move, move)]
-        if damping <= FIRST_DAMPING and _promise(gm, hm) < least_gain + LEAST_RELATIVE * abs(cost):
+        if not move.any() or (not damping and gm @ np.linalg.solve(hm, gm) < least_gain + LEAST_RELATIVE * abs(cost)):
             break
         while True:
             step = np.zeros_like(x)
             step[move] = -np.linalg.solve(hm + damping * np.diag(np.diag(hm)), gm)
             tried = np.clip(x + step, lower, upper)
             # Derivatives are most of the work; a step that is refused needs none.
-            new_cost = problem.sums(space, tried, derivatives=False).excess[use].sum() + weak @ tried**2
-            if new_cost <= cost or damping > MOST_DAMPING:
+            now = _penalized(problem.sums(space, tried, derivatives=False), weak, tried, use, reference=reference)
+            if now <= cost or damping > MOST_DAMPING:
                 break
-            damping = max(damping * STIFFER, REFUSED_DAMPING)
-        if not new_cost <= cost:
+            damping = max(damping * STIFFER, FIRST_DAMPING)
+        # Also where the sum is no number: so far away that the model has no intensities.
+        if not now <= cost:
             break
-        gain = cost - new_cost
-        x, sums, cost = tried, problem.sums(space, tried), new_cost
-        damping = max(damping / STIFFER, LEAST_DAMPING)
+        gain, x, cost, sums = cost - now, tried, now, problem.sums(space, tried)
+        damping = damping / STIFFER if damping > FIRST_DAMPING else 0.0
         if gain < least_gain + LEAST_RELATIVE * abs(cost):
             break
     return Fit(x, sums, float(sums.excess[use].sum()))
 
 
-def _promise(g: Array, h: Array) -> float:
-    return float(g @ np.linalg.solve(h, g))
+def _penalized(sums: Sums, weak: Array, values: Array, use: Sequence[int], *, reference: float) -> float:
+    """Chi-square over its stretch, of some folds whose noise is `reference` as a whole, and the prior."""
+    freedom = max(float(sums.freedom[use].sum()), 1e-300)
+    return float(sums.excess[use].sum() * reference / freedom + weak @ values**2)
 
 
 def score(sums: Sums, active: int, new: slice, weak: Array) -> tuple[float, Array]:
@@ -219,15 +212,8 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
     spent = np.zeros(space.size)
     for fold in range(problem.folds):
         others = [f for f in range(problem.folds) if f != fold]
-        if problem.far_from_linear:
-            values = minimize(problem, space, full.values, others, steps=FEW_STEPS).values
-        else:
-            values = _one_step(full, space, others, weak)
-            if _worse(problem, space, full, values, folds=others, weak=weak):
-                # The least certain values moved farther than one step can tell.
-                least = max(LEAST_GAIN, HELD_OUT_RELATIVE * abs(full.excess))
-                fit = minimize(problem, space, full.values, others, steps=MANY_STEPS, least_gain=least, weak=weak)
-                values = fit.values
+        least = max(LEAST_GAIN, HELD_OUT_RELATIVE * abs(full.excess))
+        values = minimize(problem, space, full.values, others, least_gain=least, weak=weak).values
         if local.any():
             start = np.where(local, full.values, values)
             fit = minimize(problem, space, start, [fold], free=local, steps=3)
@@ -274,24 +260,6 @@ def _in_sample(space: Space, full: Fit, weak: Array) -> HeldOut:
     shares = full.sums.shares.sum(axis=2) * [1.0, share, 1.0, share]
     excess = float(full.sums.excess.sum())
     return HeldOut(excess, max(share * freedom, 1e-300), square, max(share * count, 1e-300), shares)
-
-
-def _worse(problem: Problem, space: Space, full: Fit, values: Array, *, folds: Sequence[int], weak: Array) -> bool:
-    """Whether the data of these folds and the prior are fitted worse than by the fit to all of them."""
-    new = problem.sums(space, values, derivatives=False)
-    gain = full.sums.excess[folds].sum() - new.excess[folds].sum() + weak @ (full.values**2 - values**2)
-    return not gain >= 0
-
-
-def _one_step(full: Fit, space: Space, folds: Sequence[int], weak: Array) -> Array:
-    """Minimum for some of the folds, one Gauss-Newton step from the minimum for all: they are close."""
-    if not space.size:
-        return full.values
-    g = full.sums.gradient[folds].sum(axis=0) + weak * full.values
-    h = full.sums.curvature[folds].sum(axis=0) + np.diag(weak)
-    lower, upper = space.joined("lower"), space.joined("upper")
-    step = np.where(space.fixed, 0.0, np.linalg.solve(h, g))
-    return np.asarray(np.clip(full.values - step, lower, upper))
 
 
 @dataclass

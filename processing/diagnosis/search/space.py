@@ -153,13 +153,11 @@ class Problem(Protocol):
     folds : parts that are held out in turn; `holds_out_states` says that the parts are states.
     noise_known : the excess is in units of a known noise.
     spread : see `Moments`.
-    far_from_linear : fits to parts of the data are further apart than one Gauss-Newton step can tell.
     """
 
     folds: int
     noise_known: bool
     holds_out_states: bool
-    far_from_linear: bool
     spread: float
 
     def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:

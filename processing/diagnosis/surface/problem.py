@@ -72,7 +72,6 @@ class SurfaceProblem:
     """Captures of one object with one instrument against instrument and reflectance model."""
 
     holds_out_states = False
-    far_from_linear = True
     noise_known = True
     spread = 1.0
     folds = FOLDS
