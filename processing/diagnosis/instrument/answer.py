@@ -33,11 +33,10 @@ from processing.diagnosis.search.result import (
     Ranked,
 )
 from processing.diagnosis.search.rules import (
-    DECISIVE,
-    DOUBTED,
     FAR_OFF,
     LIKELY,
     MOST_RANKED,
+    NEEDED,
     SEEN,
     SMALL,
     SURE,
@@ -226,9 +225,9 @@ def told_answer(cause: Cause, doubt: str | None) -> tuple[Answer, float]:
     another reason is not told."""
     if doubt is None:
         return cause.answer, cause.probability
-    probability = min(cause.probability, DOUBTED)
+    probability = min(cause.probability, LIKELY)
     if doubt not in PARTS or cause.probability < SURE:
-        return "unknown", min(probability, LIKELY)
+        return "unknown", probability
     return "one of" if cause.alternatives else "unlisted" if cause.candidates[0].price else "likely", probability
 
 
@@ -236,28 +235,11 @@ def told_switches(problem: InstrumentProblem, solved: Solution) -> list[FoundEff
     """Pixels that are left out because what they say is another thing than the others say."""
     told = []
     for candidate, part in solved.space.pairs:
-        if not candidate.effect.is_switch:
-            continue
-        without = left_without(problem, solved, (candidate,))
-        gain = without.excess - solved.after.excess
-        if gain > DECISIVE:
-            told.append(
-                FoundEffect(
-                    kind=candidate.kind,
-                    element=candidate.place or None,
-                    parameters=parameters_of(candidate, solved.fit.values[part], solved.fit.values[part]),
-                    evidence=gain,
-                    indistinguishable_from=(),
-                    scope=scope_of(candidate),
-                    capture=None if candidate.capture is None else problem.captures[candidate.capture].name,
-                    removal_chance=0.0,
-                    confident=True,
-                    probability=1.0,
-                    answer="sure",
-                    residual_without=error(problem, solved, without),
-                    residual_with=error(problem, solved, solved.after),
-                )
-            )
+        if candidate.effect.is_switch:
+            value, never = solved.fit.values[part], np.zeros((1, 1))
+            gain = left_without(problem, solved, (candidate,)).excess - solved.after.excess
+            cause = Cause((candidate,), (value,), (never,), probability=1.0, log_odds=gain / 2, alternatives=())
+            told += told_effects(problem, solved, cause, None, not_applied=None) if gain > 2 * NEEDED else []
     return told
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from processing.arrays import Array
 from processing.computing.blas import one_blas_thread
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
@@ -44,7 +43,7 @@ from processing.diagnosis.search.decision import Judgement, beyond_chance, refus
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, FoundEffect, Unexplained
-from processing.diagnosis.search.rules import GROWTH, LIKELY, MOST_TRIED, OUTSTANDING
+from processing.diagnosis.search.rules import LIKELY, MOST_TRIED, OUTSTANDING
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture, CaptureError
 
@@ -55,8 +54,7 @@ class Outcome:
 
     Attributes
     ----------
-    structure : whether any test sees structure in what the mean of the posterior leaves; left : chi-square of it, in
-        units of each capture's own.
+    structure : whether any test sees structure in what the mean of the posterior leaves; left : chi-square of it.
     """
 
     bench: WholeBench
@@ -70,36 +68,13 @@ class Outcome:
 
 
 def outcome_of(bench: WholeBench, found: Posterior) -> Outcome:
-    """Test what is left; where single tests see structure that the sum of squares does not, weigh all anew."""
+    """Test what a posterior leaves."""
     asked, solved = predicts(bench.problem), solution(bench, found)
     captures = range(len(asked.captures))
     before = tuple(residual(asked, k, solved.base, solved.before_fit) for k in captures)
-    after = residuals(asked, solved)
-    units = np.array([1 + left_of(asked, r) / directions(asked, k) for k, r in enumerate(after)])
-    if asked.noise_known and grown(units, found.samples.best.unit):
-        found = bench.weighed(found, units)
-        solved = solution(bench, found)
-        after = residuals(asked, solved)
-    else:
-        units = np.ones(len(after))
-    left = float(sum(left_of(asked, r) / u for r, u in zip(after, units, strict=True)))
+    after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
+    left = sum(left_of(asked, r) for r in after)
     return Outcome(bench, asked, found, solved, before, after, has_structure(asked, after), left)
-
-
-def residuals(problem: InstrumentProblem, solved: Solution) -> tuple[Residual, ...]:
-    """What a correction leaves of every capture."""
-    return tuple(residual(problem, k, solved.space, solved.fit) for k in range(len(problem.captures)))
-
-
-def grown(units: Array, unit: float) -> bool:
-    """Whether a capture leaves more, in units of chi-square, than the posterior reckoned with."""
-    return bool(units.max() > GROWTH * unit)
-
-
-def directions(problem: InstrumentProblem, k: int) -> float:
-    """Independent directions over which structure spreads in one capture."""
-    free, power = problem.powers()[k]
-    return max(free * float(power.sum() ** 2 / np.sum(power**2)), 1.0)
 
 
 def has_structure(problem: InstrumentProblem, after: Collection[Residual]) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -29,14 +29,13 @@ from processing.diagnosis.search.rules import (
 STANDS = "the edges, which were left out of the fit, do not move as it says"
 #: Optics, mechanics and detector are the same for the whole image.
 NOT_ALIKE = "it differs from part to part of the image, which this effect does not"
-#: [chi-square, fixed] That has odds of 99 to 1.
-STANDS_OUT = 2 * float(np.log(SURE / (1 - SURE)))
+#: [log odds, fixed] Of 99 to 1.
+STANDS_OUT = float(np.log(SURE / (1 - SURE)))
 #: Reasons that say that something else is there, of which what the cause explains is left over.
 ELSE = (STANDS, NOT_ALIKE)
 #: The reason for which nothing is written for later captures: the sample or its light changed, and what is found beside
 #: that may be a part of it.
 OF_THE_SAMPLE = "it differs from part to part of the image, which a source does not"
-CHANGED = (OF_THE_SAMPLE,)
 #: Reasons that leave a name likely.
 PART_OF_LEFT = "it may be a part of what is left unexplained"
 PART_OF_UNLISTED = "it may be a part of the fault that has no name"
@@ -48,17 +47,15 @@ def doubts(
 ) -> dict[Cause, str]:
     """Reasons by cause; a cause without one may be called by its name. `left` is the chi-square of structure."""
     out: dict[Cause, str] = {}
-    uneven = 0.0
     still = _standing(problem, solved, causes)
     even = Evenness(problem, solved.space, solved.fit.values)
     for cause in causes:
         reason = STANDS if cause in still else _of_itself(problem, found, solved, cause, causes=causes, even=even)
         if reason is not None:
             out[cause] = reason
-        if reason == OF_THE_SAMPLE:
-            uneven = max(uneven, cause.log_odds)
     # What is something else took away a part of what is left over.
-    left += sum(2 * cause.log_odds * found.samples.best.unit for cause in something_else(out))
+    another = [c.log_odds for c, why in out.items() if why in ELSE and c.log_odds > STANDS_OUT]
+    left += 2 * found.samples.best.unit * sum(another)
     for rank, cause in enumerate(causes, 1):
         if problem.noise_known:
             weak = 2 * cause.log_odds * found.samples.best.unit < TIMES * rank**2 * left
@@ -68,19 +65,11 @@ def doubts(
             weak = cause.log_odds < max(CERTAIN, TIMES * rest / 2)
         if cause not in out and weak:
             out[cause] = PART_OF_LEFT
-        # What is uneven is another cause, and smaller effects beside it may be parts of it.
-        if cause not in out and cause.log_odds < uneven:
-            out[cause] = "it may be a part of what is uneven over the image"
     # A sentence is a part of an unknown mechanism, whose other parts look like effects of the list.
     unlisted = [k for k in range(len(found.members)) if found.label(k).price]
     if found.samples.any_of(unlisted) > 0.5:
         out |= {cause: PART_OF_UNLISTED for cause in causes if cause not in out and cause.answer != "unlisted"}
     return out
-
-
-def something_else(doubt: Mapping[Cause, str], least: float = STANDS_OUT) -> list[Cause]:
-    """Causes that are something else and explain more than `least` of chi-square; less may be chance."""
-    return [cause for cause, why in doubt.items() if why in ELSE and 2 * cause.log_odds > least]
 
 
 def _of_itself(

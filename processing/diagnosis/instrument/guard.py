@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.answer import stretch
-from processing.diagnosis.instrument.doubts import CHANGED
+from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.decision import PredictedChange, chance_checks, held_out_check, rows_checks
 from processing.diagnosis.search.fit import Fit, Solution
@@ -70,7 +70,7 @@ def lasts(later: PredictedChange, reasons: Collection[str] = ()) -> bool:
 
     Where the sample changed, what is found of the instrument may be a part of that.
     """
-    return later.chance_worse <= CHANCE_WORSE and not any(reason in CHANGED for reason in reasons)
+    return later.chance_worse <= CHANCE_WORSE and OF_THE_SAMPLE not in reasons
 
 
 def _rows(problem: InstrumentProblem, k: int, space: Space, fit: Fit) -> Array:

@@ -77,8 +77,6 @@ class InstrumentProblem:
         self.folds = folds or folds_of(self.captures)
         self.moments: tuple[Moments, ...] = tuple(moments_of(c, self.folds) for c in self.captures)
         self._built: list[dict[tuple[str, bytes], Array]] = [{} for _ in self.captures]
-        #: What a chi-square of each capture counts; less where structure is left in it.
-        self.weights = np.ones(len(self.captures))
         self.noise_known = all(c.noise_known for c in self.captures)
         self.holds_out_states = any(m.tiles is None for m in self.moments)
         self.spread = max(m.spread for m in self.moments)
@@ -311,7 +309,6 @@ class InstrumentProblem:
         """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
         other, local = self.near(space, values)
         if other is not self:
-            other.weights = self.weights
             return other.sums(space, local, derivatives=derivatives)
         out = Sums.empty(self.folds, space.size if derivatives else 0, len(self.captures))
         for k, data in enumerate(self.captures):
@@ -323,7 +320,7 @@ class InstrumentProblem:
                 self._tile_sums(k, mine, own, changes, out=part, derivatives=derivatives)
             else:
                 self._block_sums(k, mine, own, changes, out=part, derivatives=derivatives)
-            out.add(k, part, acting, float(self.weights[k]))
+            out.add(k, part, acting)
         return out
 
     def noise_information(self, space: Space, values: Array) -> Array:

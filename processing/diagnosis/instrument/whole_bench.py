@@ -17,15 +17,13 @@ from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.descent import LEAST_WIDTH
 from processing.diagnosis.search.fit import Fit, Solution, held_out, minimize, prior, score
 from processing.diagnosis.search.likely_set import everything
-from processing.diagnosis.search.posterior import Posterior, Say, first_look, posterior, resampled
+from processing.diagnosis.search.posterior import Posterior, Say, first_look, posterior
 from processing.diagnosis.search.rules import (
-    DECISIVE,
     EXACT,
     FAR_OFF,
     GROWTH,
     LIKELY,
     NEEDED,
-    ROUNDS,
     SEEN,
     SHARES,
     TAKES_PART,
@@ -204,14 +202,6 @@ class WholeBench:
     def _unknowns(self, k: int) -> int:
         return int(np.linalg.matrix_rank(self.whole.columns(k, self.whole.changes(k, Space(()), np.zeros(0)))))
 
-    def weighed(self, found: Posterior, units: Array) -> Posterior:
-        """The same with a unit of chi-square of its own for each capture: structure in one does not devalue others."""
-        self.whole.weights = 1 / units
-        # Of one capture the weight is another unit; of several the least certain values move far.
-        out = resampled(self.whole, found, rounds=1 if units.size == 1 else ROUNDS)
-        self.whole.weights = np.ones(units.size)
-        return out
-
     def _offered(self, candidate: Candidate) -> bool:
         effect = candidate.effect
         if effect.varies_over_image or effect.is_switch:
@@ -306,7 +296,7 @@ class WholeBench:
         parts = dict(both.pairs)
         gains = {c: score(sums, space.size, parts[c], prior(both))[0] / unit for c in fields}
         best = max(gains, key=lambda c: gains[c])
-        if gains[best] < DECISIVE:
+        if gains[best] < 2 * NEEDED:
             return found
         self.say(f"with {', '.join(c.label for c in fields)}")
         self._take_noise_of_light([*fixed, *plain, *fields], fixed)

@@ -18,7 +18,7 @@ from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.initial_values import best_of_starts
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.fit import minimize
-from processing.diagnosis.search.rules import DECISIVE, OUTSTANDING
+from processing.diagnosis.search.rules import NEEDED, OUTSTANDING
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 
@@ -80,7 +80,7 @@ def miswired_train(problem: InstrumentProblem, declared: InstrumentModel | None 
 
 
 def _best(mistakes: Sequence[Wiring], lefts: Sequence[float], start: float) -> Wiring | None:
-    found = [(left, k) for k, left in enumerate(lefts) if left < start / WIRING and start - left > DECISIVE]
+    found = [(left, k) for k, left in enumerate(lefts) if left < start / WIRING and start - left > 2 * NEEDED]
     return mistakes[min(found)[1]] if found else None
 
 

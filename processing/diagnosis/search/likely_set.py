@@ -1,12 +1,10 @@
-"""A likely set of groups to start from: from nothing upwards, from everything downwards, and without what can imitate
-many others."""
+"""A likely set of groups to start from: from nothing upwards, and from everything downwards."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from processing.diagnosis.search.rules import HOPE, NEEDED
+from processing.diagnosis.search.rules import ALTERNATIVE, NEEDED
 from processing.diagnosis.search.sets import NEVER, Sets, State
 
 #: [changes] That are tried one after the other without a gain before a climb ends.
@@ -22,27 +20,19 @@ def likely_set(sets: Sets) -> State:
     """The likeliest of some: several causes together can be plain where each alone is nothing, and the reverse."""
     up = climb(sets, sets.empty())
     down = climb(sets, thinned(sets))
-    best = max(up, down, key=lambda s: sets.fitted(s).score)
-    large = sets.many & sets.free
-    for k in np.flatnonzero((best.tau > 0) & large):
-        # Many values can do what two or three small causes do, each of which gains nothing beside them.
-        without = sets.without(best, int(k))
-        other = climb(sets, climb(sets, without, never=large & (without.tau == 0)))
-        best = max(best, other, key=lambda s: sets.fitted(s).score)
-    return best
+    return max(up, down, key=lambda s: sets.fitted(s).score)
 
 
-def climb(sets: Sets, state: State, never: NDArray[np.bool_] | None = None) -> State:
-    """The change of one group that gains most, as long as one gains; the unit follows. `never` (G,) are not added."""
+def climb(sets: Sets, state: State) -> State:
+    """The change of one group that gains most, as long as one gains; the unit follows."""
     state = sets.settled(state.copy())
     best, barred = sets.fitted(state).score, np.zeros(len(sets.groups), dtype=bool)
-    open_to = sets.free if never is None else sets.free & ~never
     for _ in range(STEPS):
         c = sets.conditional(state, follow=True)
         there = state.tau > 0
-        gain = np.where(open_to & ~barred, np.where(there, -c.log_odds, c.log_odds), -np.inf)
+        gain = np.where(sets.free & ~barred, np.where(there, -c.log_odds, c.log_odds), -np.inf)
         k = int(np.argmax(gain))
-        if gain[k] < HOPE or barred.sum() > PATIENCE:
+        if gain[k] < -ALTERNATIVE or barred.sum() > PATIENCE:
             break
         tried = state.copy()
         tried.tau[k] = 0.0 if there[k] else sets.taus[int(np.argmax(c.tau_weights[k]))]

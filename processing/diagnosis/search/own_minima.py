@@ -19,7 +19,7 @@ from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.likely_set import retune
 from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
 from processing.diagnosis.search.posterior import Posterior, Say
-from processing.diagnosis.search.rules import BOUND, EXPLAINS, HOPE, IMITATES
+from processing.diagnosis.search.rules import ALTERNATIVE, BOUND, EXPLAINS, IMITATES
 from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Problem, Space
 
@@ -182,7 +182,7 @@ class OwnMinima:
         """Groups that may be worth a fit beside a set, the most promising first."""
         sets, state = self.beside(here)
         odds = sets.conditional(state).log_odds
-        order = [int(g) for g in np.argsort(-odds) if g not in here.groups and odds[g] > HOPE]
+        order = [int(g) for g in np.argsort(-odds) if g not in here.groups and odds[g] > -ALTERNATIVE]
         return order[:LEADERS]
 
     def posterior(self, here: Visited) -> PosteriorOfMinima:

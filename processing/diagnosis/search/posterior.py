@@ -16,22 +16,21 @@ from processing.diagnosis.search.averages import Samples, sample, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.descent import STEPS, all_at_once, improved, mean_over_sets, minimum_of, next_values
 from processing.diagnosis.search.down_to_noise import down_to_noise
-from processing.diagnosis.search.likely_set import climb, likely_set
+from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
 from processing.diagnosis.search.rules import (
+    ALTERNATIVE,
     BENT,
     CERTAIN,
     CHANGES,
-    EXACT,
     FEWER_ROUNDS,
     GROWTH,
-    HOPE,
     ROUNDS,
     SAMPLES,
     SAMPLES_BEFORE,
     TAU,
 )
-from processing.diagnosis.search.sets import Group, Noise, Sets, State
+from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Problem, Space, Sums
 
 #: Called with a line that says what is being done.
@@ -131,10 +130,8 @@ def _looking(
     space: Space,
     groups: Sequence[Group],
     climbed: Callable[[Sets], State],
-    *,
-    noise: Noise | None = None,
 ) -> Look:
-    """What linearizes a problem and finds a set; with the noise that is there unless one is given."""
+    """What linearizes a problem and finds a set."""
 
     def look(x: Array) -> _Round | None:
         problem.relinearize(space, x)
@@ -142,7 +139,7 @@ def _looking(
         form = quadratic(problem, space, x, sums)
         if not (np.isfinite(form.excess) and np.all(np.isfinite(form.curvature))):
             return None
-        sets = Sets(form, groups, noise or noise_of(problem, sums))
+        sets = Sets(form, groups, noise_of(problem, sums))
         return _Round(x, form.at(x / space.joined("typical")), sets, climbed(sets))
 
     return look
@@ -179,17 +176,11 @@ def _found(
     rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
     if first.state.unit > BENT or not problem.noise_known:
         # Several large causes, none of which explains much alone, or far from linear: all of them at once first, as
-        # large as they may be; or with the least values, where a straight line holds, if they leave nothing but noise.
-        begun = [look(all_at_once(problem, space, fixed, start, noise=first.sets.noise, tau=TAU[-1]))]
-        if problem.noise_known:
-            least = look(all_at_once(problem, space, fixed, start, noise=first.sets.noise, tau=EXACT))
-            begun += [least] if least is not None and least.state.unit <= BENT else []
-        first = max((one for one in begun if one is not None), key=lambda one: one.score, default=first)
+        # large as they may be.
+        first = look(all_at_once(problem, space, fixed, start, noise=first.sets.noise, tau=TAU[-1])) or first
         problem.relinearize(space, first.about)
         rounds -= 1
-    last = _without_alternatives(
-        problem, space, _settled(problem, space, first, look, rounds=rounds), look, rounds=rounds
-    )
+    last = _settled(problem, space, first, look, rounds=rounds)
     down = problem.noise_known and last.state.unit <= BENT
     # Structure is described by whatever comes nearest to it: what is found beside it is not compared so closely.
     last, others = _of_bends(problem, space, last, bends if down else (), look=look)
@@ -222,24 +213,6 @@ def _of_bends(
     return best, {k: tuple(sorted({j for on in likely if k not in on for j in on - own})) for k in own}
 
 
-def _without_alternatives(problem: Problem, space: Space, found: _Round, look: Look, *, rounds: int) -> _Round:
-    """The same from a start without what is one of many alternatives, where that is likelier.
-
-    An axis that slips by degrees where hardly anything depends on it is a place of its own: about it no straight line
-    leads back to nothing.
-    """
-    chosen = (found.state.tau > 0) & (found.sets.share > 1)
-    if not chosen.any():
-        return found
-    without = found.sets.settled(State(np.where(chosen, 0.0, found.state.tau), found.state.unit))
-    first = look(minimum_of(problem, space, found.sets, without))
-    other = None if first is None else _settled(problem, space, first, look, rounds=rounds)
-    if other is not None and other.score > found.score:
-        return other
-    problem.relinearize(space, found.about)
-    return found
-
-
 def _settled(problem: Problem, space: Space, first: _Round, look: Look, *, rounds: int) -> _Round:
     """Linearized anew about what was found, at most so many times, until it stays.
 
@@ -257,7 +230,7 @@ def _settled(problem: Problem, space: Space, first: _Round, look: Look, *, round
         noise, told = now.sets.noise, now.sets.form.at(x / space.joined("typical"))
         if noise.unit(new.excess) <= GROWTH * noise.unit(told):
             score = max(score, now.score)
-        if new.score < score + HOPE:
+        if new.score < score - ALTERNATIVE:
             break
         now = new
     problem.relinearize(space, now.about)
@@ -267,20 +240,6 @@ def _settled(problem: Problem, space: Space, first: _Round, look: Look, *, round
 def _averaged(sets: Sets, state: State) -> Samples:
     """Average over sets; where what is left is the noise each has a unit of its own, and counts by its evidence."""
     return stay(sets, state, CHANGES) if sets.noise.known else sample(sets, state, SAMPLES)
-
-
-def resampled(problem: Problem, found: Posterior, rounds: int) -> Posterior:
-    """The same with other weights of the captures, from the likeliest set on; linearized anew at most so many times."""
-    space, old = found.space, found.sets
-    look = _looking(problem, space, old.groups, lambda sets: climb(sets, found.samples.best), noise=old.noise)
-    first = look(found.values)
-    if first is None:
-        return found
-    last = _settled(problem, space, first, look, rounds=rounds)
-    samples = _averaged(last.sets, last.state)
-    return _posterior_of(
-        problem, space, found.members, last.sets, samples=samples, about=last.about, others=found.others
-    )
 
 
 def _posterior_of(

@@ -74,15 +74,9 @@ GAIN_OFF = 0.03
 FAR_OFF = 0.05
 #: [unit of chi-square] After the first choice of groups, from which on the first linearization is not believed.
 BENT = 2.0
-#: [log odds] Loss of a change of the set, or of a new linearization, that is still tried: the unit of chi-square may
-#: fall with it.
-HOPE = -6.0
 #: [log odds] At which evidence decides by itself, 1 to 160 000: a group is not taken away any more, a correction is
-#: dropped that the scatter of the counts contradicts.
+#: dropped that the scatter of the counts contradicts, and something that needs a search of its own is looked into.
 NEEDED = 12.0
-#: [chi-square] Gain from which on something that needs a search of its own (a retardance that varies over the image,
-#: clipped pixels, a mistake of wiring) is looked into.
-DECISIVE = 25.0
 #: [1] Growth of the unit of chi-square, by what the tests of the residual find, from which on the sets are visited
 #: again; and at values beyond what a straight line to them promised, from which on it is not believed.
 GROWTH = 1.05
@@ -126,9 +120,8 @@ TILES = 8
 SURE = 0.99
 #: [probability] From which on a cause is called likely.
 LIKELY = 0.9
-#: [probability] Most that is told of a cause that may be a part of what is left unexplained.
-DOUBTED = 0.95
-#: [log odds] By which another group, or set, may be worse in one's place and still be visited: 1 to 1100.
+#: [log odds] By which another group, or set, may be worse and still be tried, 1 to 1100: the unit of chi-square may
+#: fall with it.
 ALTERNATIVE = 7.0
 #: [of what the cause explains] The same: no effect's model is exact.
 ALIKE = 1e-3

@@ -44,18 +44,18 @@ class Sums:
         gradient, stretch = np.zeros((2, f, k))
         return cls(a, b, c, d, gradient, np.zeros((f, k, k)), stretch, np.zeros((captures, 4, f)))
 
-    def add(self, capture: int, part: Sums, acting: Acting, weight: float = 1.0) -> None:
-        """Add the sums of one capture, derived by what is `acting` on it; its chi-square counts `weight`."""
-        self.excess += weight * part.excess
-        self.freedom += weight * part.freedom
+    def add(self, capture: int, part: Sums, acting: Acting) -> None:
+        """Add the sums of one capture, derived by what is `acting` on it."""
+        self.excess += part.excess
+        self.freedom += part.freedom
         self.square += part.square
         self.count += part.count
         self.shares[capture] += part.square, part.count, part.excess, part.freedom
         if part.gradient.shape[1]:
             index = acting.index
-            self.gradient[:, index] += weight * acting.spread(part.gradient)
-            self.stretch[:, index] += weight * acting.spread(part.stretch)
-            self.curvature[:, index[:, None], index] += weight * acting.spread_products(part.curvature)
+            self.gradient[:, index] += acting.spread(part.gradient)
+            self.stretch[:, index] += acting.spread(part.stretch)
+            self.curvature[:, index[:, None], index] += acting.spread_products(part.curvature)
 
 
 @dataclass(frozen=True)
