@@ -103,7 +103,7 @@ class WholeBench:
         return Fit(values, self.whole.sums(space, values, derivatives=False), 0.0).rms > FAR_OFF
 
     def run(self) -> Posterior:
-        """The posterior; again with the noise that its light tells, and with what varies over the image."""
+        """The posterior with the noise that its light tells; again with what varies over the image."""
         plain = [c for c in self.pool if self._offered(c)]
         fixed = [*self.base.candidates, *self._clipped()]
         self._take_noise_of_light([*fixed, *plain], fixed)
@@ -118,23 +118,7 @@ class WholeBench:
             # What the noise seemed to speak against may be right beside what varies over the image.
             beside = self._with_fields(found, fixed, plain, fields)
             found = found if beside is found else self._with_what_scatters_so(beside, fixed)
-        solved = applied(found, self.base)
-        if self.whole.noise_known and self._adopt_noise(*solved):
-            self.say("the same with the noise that this light has")
-            again = self._posterior(list(found.space.candidates), fixed, found)
-            # Nobody knows the noise to a thousandth, and of many pixels that would be structure: what was found stays.
-            # So it does where the new mean leaves more of the counts than its linearization promised.
-            same_unit = again.samples.best.unit <= GROWTH * found.samples.best.unit
-            found = again if same_unit and self._left_by(again) <= GROWTH * self._left_by(found) else found
         return found
-
-    def _left_by(self, found: Posterior) -> float:
-        """Chi-square for each degree of freedom that the correction of a posterior leaves of the counts."""
-        space, values = applied(found, self.base)
-        # Counts undone there, not the series about another point, which can promise anything.
-        self.whole.relinearize(space, values)
-        sums = self.whole.sums(space, values, derivatives=False)
-        return 1 + float(sums.excess.sum() / sums.freedom.sum())
 
     def _take_noise_of_light(self, candidates: Sequence[Candidate], fixed: Sequence[Candidate]) -> None:
         """Take the noise from the light that a first look tells, until it stays, or what is left of the counts grows.

@@ -15,7 +15,6 @@ from processing.arrays import Array
 from processing.diagnosis.search.averages import Samples, sample, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.descent import STEPS, all_at_once, improved, mean_over_sets, minimum_of, next_values
-from processing.diagnosis.search.down_to_noise import down_to_noise
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
 from processing.diagnosis.search.rules import (
@@ -94,13 +93,6 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     members, groups = grouped(space, fixed)
     bends = [g for g, own in enumerate(members) if space.candidates[own[0]].is_pointwise]
     about, sets, state, others = _found(problem, space, fixed, groups, start=start, bends=bends)
-    if problem.noise_known and state.unit > BENT:
-        say("structure is left: once more, with every intensity counted in full")
-        explained = down_to_noise(problem, space, fixed, groups, start=start, noise=sets.noise, unit=state.unit)
-        if explained is None:
-            problem.relinearize(space, about)
-        else:
-            (about, sets, state), others = explained, {}
     samples = _averaged(sets, state)
     there = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(there) or 'nothing'}; unit of chi-square {state.unit:.3g}")
@@ -255,9 +247,7 @@ def _posterior_of(
     """The posterior of a problem linearized `about` values (K,)."""
     typical, values = space.joined("typical"), mean_over_sets(space, samples, np.ones(space.size))
     there = problem.sums(space, values, derivatives=False)
-    # Of the directions over which structure spreads, also where the sets counted every intensity in full.
-    noise = noise_of(problem, there)
-    if not noise.unit(_total(problem, there)) <= GROWTH * noise.unit(sets.form.at(values / typical)):
+    if not sets.noise.unit(_total(problem, there)) <= GROWTH * sets.noise.unit(sets.form.at(values / typical)):
         # The least certain values lie along a bent valley, in which the straight line to their mean does not stay.
         values = improved(problem, space, sets.groups, samples, starts=[about], steps=2 * STEPS)
     return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical), others)
