@@ -9,7 +9,6 @@ from bench_capture import bench_capture, read
 from processing.diagnosis.captured.screening import without_steep_pixels
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.search.rules import NEEDED
 from processing.diagnosis.search.space import Space
 from simulators.blind.undeclared_captures import TrueBench
@@ -35,7 +34,7 @@ def test_light_that_leaks_scatters_and_an_offset_does_not(configs, tmp_path, lea
     offset, leak = (next(c for c in problem.pool() if c.kind == kind) for kind in ("detector_offset", "psa_extinction"))
     # Either describes the counts: what is left is noise. The scatter knows which it is.
     there, value = (leak, np.array([0.1])) if leaks else (offset, np.array([80.0]))
-    gain = scatter_prefers(problem, Space((there,)), value, {offset: np.array([80.0])}, old={})
+    gain = scatter_prefers(problem, Space((there,)), value, {offset: np.array([80.0])})
     assert gain < -NEEDED if leaks else gain > NEEDED
 
 
@@ -49,7 +48,7 @@ def test_counts_scatter_as_the_bend_says_that_made_them(configs, tmp_path, size)
     bend = next(c for c in problem.pool() if c.kind == "detector_nonlinearity")
     full_scale = data.conditions.full_scale * bench.gain
     value = np.array([size * full_scale / 10_000])
-    assert scatter_prefers(problem, Space((bend,)), value, {bend: value}, old={}) > NEEDED
+    assert scatter_prefers(problem, Space((bend,)), value, {bend: value}) > NEEDED
 
 
 def test_what_a_fit_leaves_of_the_optics_is_no_noise(configs, tmp_path):
@@ -59,7 +58,7 @@ def test_what_a_fit_leaves_of_the_optics_is_no_noise(configs, tmp_path):
     problem = InstrumentProblem(model, [data], folds=1)
     offset = next(c for c in problem.pool() if c.kind == "detector_offset")
     # The plate is not in the fit, so much is left over. More light below black would scatter more, but nothing does.
-    assert scatter_prefers(problem, Space(()), np.zeros(0), {offset: np.array([-400.0])}, old={}) < -NEEDED
+    assert scatter_prefers(problem, Space(()), np.zeros(0), {offset: np.array([-400.0])}) < -NEEDED
 
 
 @pytest.mark.parametrize("stated", [True, False])
@@ -104,27 +103,3 @@ def test_pixels_at_an_edge_are_left_out_and_those_of_a_slope_are_not(configs, tm
     # All edges: there is nothing else to look at than the flattest quarter.
     stripes = 0.2 + 0.4 * np.arange(SIDE) / SIDE * (np.arange(SIDE) % 2)
     assert left(stripes).usable.mean() == pytest.approx(0.25, abs=0.05)
-
-
-@pytest.mark.long
-def test_a_mean_that_only_its_linearization_explains_is_not_taken(configs, tmp_path, monkeypatch):
-    """The search with the noise of the light ends far off in a capture of air: what was found before it stays."""
-    bench = TrueBench(rows=SIDE, columns=SIDE, electrons=6000.0)
-    bench.ellipticity = np.deg2rad(3.0)
-    model, data = captured(tmp_path, configs, bench)
-    whole = WholeBench(InstrumentProblem(model, [data], folds=2), lambda step: None)
-    search, again = whole._posterior, []
-
-    def far_off(candidates, fixed, old=None):
-        found = search(candidates, fixed, old)
-        if old is None:
-            return found
-        again.append(found)
-        return replace(found, values=2 * found.values)
-
-    monkeypatch.setattr(whole, "_posterior", far_off)
-    monkeypatch.setattr(whole, "_adopt_noise", lambda space, values: True)
-    found = whole.run()
-    assert again
-    part = dict(zip((c.kind for c in found.space.candidates), found.space.slices, strict=True))
-    assert np.abs(found.values[part["generator_ellipticity"]]) == pytest.approx(3.0, abs=0.1)

@@ -24,8 +24,8 @@ from processing.diagnosis.search.space import Space
 Undone = Mapping[Candidate, Array]
 
 
-def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new: Undone, *, old: Undone) -> float:
-    """Log likelihood of the residual with the noise of the counts that `new` undoes, over that with `old`.
+def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new: Undone) -> float:
+    """Log likelihood of the residual with the noise of the counts that `new` undoes, over that of counts as stored.
 
     The residual is that of the captures at `values` (K,), the same in both. Of many pixels the noise's own error
     (`NOISE_LEVEL`) is larger than what chance does to their scatter: they say no more than it lets them. Noise that was
@@ -46,7 +46,7 @@ def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new
         share, good = free * near.moments[k].left, data.usable & ~data.clipped
         before, after = (
             _log_scatter(still, rest, share, near.moments[k].counts, good=good, correct=undoing(still, undone))
-            for undone in (old, new)
+            for undone in ({}, new)
         )
         gain += 0.5 * (before - after)
         pairs += float(share.sum()) * good.sum() / 2

@@ -21,7 +21,6 @@ from processing.diagnosis.search.posterior import Posterior, Say, first_look, po
 from processing.diagnosis.search.rules import (
     EXACT,
     FAR_OFF,
-    GROWTH,
     LIKELY,
     NEEDED,
     SEEN,
@@ -121,37 +120,19 @@ class WholeBench:
         return found
 
     def _take_noise_of_light(self, candidates: Sequence[Candidate], fixed: Sequence[Candidate]) -> None:
-        """Take the noise from the light that a first look tells, until it stays, or what is left of the counts grows.
+        """Take the noise from the light that a first look tells, until it stays.
 
         Behind a bent response the noise that counts should have is wrong by percents. Of many pixels that is more than
-        most causes explain, and some other bend, with others to undo it, would be found for it. A bend that is not well
-        known makes it as wrong: too little noise is structure, beside which nothing is found.
+        most causes explain, and some other bend, with others to undo it, would be found for it.
         """
-        space = Space(tuple(candidates))
-        start = self._values_at_start(space)
         if not self.whole.noise_known:
             return
+        space = Space(tuple(candidates))
+        start = self._values_at_start(space)
         self.whole.level_noise(space, start)
-        seen, unit = first_look(self.whole, space, fixed, start)
-        told = space, start
         for _ in range(FIRST_LOOKS):
-            if self.whole.has_noise_of(space, seen):
+            if not self._adopt_noise(space, first_look(self.whole, space, fixed, start)):
                 break
-            if not self._adopt_noise(space, seen):
-                # The counts do not scatter so: without the light of one of them, the others may have theirs.
-                against = self._refuted_by_scatter(space, seen)
-                if not against:
-                    break
-                worst = min(against, key=lambda c: against[c])
-                space = Space(tuple(c for c in space.candidates if c != worst))
-                start = self._values_at_start(space)
-                seen, unit = first_look(self.whole, space, fixed, start)
-                continue
-            now, left = first_look(self.whole, space, fixed, start)
-            if left > GROWTH * unit:
-                self._adopt_noise(*told)
-                break
-            told, seen, unit = (space, seen), now, left
 
     def _adopt_noise(self, space: Space, values: Array) -> bool:
         taken = self.whole.adopt_noise(space, values)
@@ -180,7 +161,7 @@ class WholeBench:
         """Corrections of the counts that the noise speaks against, with the log likelihood that they lose."""
         undone = exactly_undone(space, values, pointwise=True)
         far = {c: v for c, v in undone.items() if np.any(np.abs(v) > EXACT * c.typical)}
-        gains = {c: scatter_prefers(self.whole, space, values, {c: v}, old={}) for c, v in far.items()}
+        gains = {c: scatter_prefers(self.whole, space, values, {c: v}) for c, v in far.items()}
         return {c: gain for c, gain in gains.items() if gain < -NEEDED}
 
     def _unknowns(self, k: int) -> int:

@@ -137,15 +137,10 @@ def _looking(
     return look
 
 
-def first_look(problem: Problem, space: Space, fixed: Sequence[Candidate], start: Array) -> tuple[Array, float]:
-    """Values (K,), mean over the sets that are likely where the problem is linearized about `start` (K,) alone.
-
-    Also the unit of chi-square of the likeliest.
-    """
+def first_look(problem: Problem, space: Space, fixed: Sequence[Candidate], start: Array) -> Array:
+    """Values (K,), mean over the sets that are likely where the problem is linearized about `start` (K,) alone."""
     first = _looking(problem, space, grouped(space, fixed)[1], likely_set)(start)
-    if first is None:
-        return start, np.inf
-    return mean_over_sets(space, sample(first.sets, first.state, SAMPLES_BEFORE), start), first.state.unit
+    return start if first is None else mean_over_sets(space, sample(first.sets, first.state, SAMPLES_BEFORE), start)
 
 
 def _total(problem: Problem, sums: Sums) -> float:
