@@ -4,10 +4,21 @@ import numpy as np
 import pytest
 
 from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 
 GAIN, READ, BLACK = 2.0, 6.0, 100
+CROSSED = """
+kind: instrument
+name: crossed
+generator:
+  - {kind: polarizer, name: p1, azimuth_deg: 0}
+  - {kind: retarder, name: psg_retarder, axis: psg, azimuth_deg: 0, retardance_deg: 90}
+analyzer:
+  - {kind: retarder, name: psa_retarder, axis: psa, azimuth_deg: 0, retardance_deg: 90}
+  - {kind: polarizer, name: p2, azimuth_deg: 90}
+"""
 ANGLES = {"psg": 4.7 * np.arange(24), "psa": 23.1 * np.arange(24)}
 
 
@@ -36,3 +47,30 @@ def test_noise_of_two_darks_is_expected_in_the_residual(kind, unknowns, syntheti
     variance = (data.slope * np.maximum(signal.mean(axis=1), 0) + data.floor) @ np.diag(outside)
     freedom = 3000 * (24 - unknowns)
     assert (left**2).sum() / (3000 * variance) == pytest.approx(1, abs=3 * np.sqrt(2 / freedom))
+
+
+@pytest.mark.parametrize("darks", [1, 4])
+@pytest.mark.parametrize("texture", [0.0, 0.5])
+def test_noise_of_darks_is_no_fault_where_states_are_dark(darks, texture, synthetic_capture, configs):
+    """Crossed polarizers let no light through in six of these states: the read-out and the darks are all the noise."""
+    turned = 4.5 * np.arange(40)
+    file = synthetic_capture.folder / "crossed.yaml"
+    file.write_text(CROSSED)
+    model = InstrumentModel.load(file)
+    angles = {"psg": turned, "psa": 5 * turned}
+    light = model.at(662).rows(angles).reshape(-1, 16) @ np.eye(4).ravel()
+    random = np.random.default_rng(77)
+    scene = 40_000 * (1 + texture * np.sin(np.arange(64) / 3) * np.cos(np.arange(48) / 5)[:, None])
+    electrons = random.poisson(np.maximum(light, 0)[:, None, None, None] * scene)
+    frames = np.concatenate([np.zeros((darks, 1, 48, 64)), electrons])
+    frames = frames + random.normal(0, 4, frames.shape)
+    path = synthetic_capture(
+        np.round(frames / 2.1 + 600).astype(np.uint16),
+        {axis: np.r_[np.zeros(darks), a] for axis, a in angles.items()},
+        role=("dark",) * darks + ("sample",) * 40,
+        sample={"kind": "air"},
+        instrument_yaml=CROSSED,
+        detector={"gain_e_per_count": 2.1, "read_noise_e": 4.0, "bits": 16},
+    )
+    found = diagnose_captures([path], model)[0].diagnosis
+    assert (found.verdict, found.effects, found.noise.verdict) == ("consistent", (), "as_declared")

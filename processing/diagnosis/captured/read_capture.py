@@ -15,6 +15,7 @@ from processing.arrays import Array
 from processing.calibration.known_sample import known_mueller
 from processing.diagnosis.captured.averaged import means, side_for, squares
 from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captured.dark_noise import without_noise_of_darks
 from processing.diagnosis.captured.noise import estimated_noise
 from processing.diagnosis.search.rules import (
     FEWEST_PIXELS,
@@ -24,10 +25,9 @@ from processing.diagnosis.search.rules import (
 )
 from processing.instrument.changes import Conditions, elapsed, elapsed_error
 from processing.instrument.model import InstrumentModel
-from processing.reduction.black import Black
 from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.frame_evidence import evidence_of
-from processing.reduction.measurement_matrix import angles_of, measurement_matrix, relative_exposure
+from processing.reduction.measurement_matrix import angles_of, relative_exposure
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
 from processing.storage.captures.capture import Capture, CaptureError
@@ -154,8 +154,6 @@ def _clip_level(capture: Capture, correction: CountCorrection) -> float | None:
 
 #: [of the mean signal] Noise that counts are weighted with where it is not known; what it is does not matter.
 SOME_NOISE = 1e-3
-#: [of the noise of the dark frames] Least part that a fit leaves of it in a state: that of none is zero.
-LEAST_OUTSIDE = 1e-9
 
 
 def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
@@ -206,10 +204,11 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     noise = NoiseModel.of(detector, integer)
     if noise is not None:
         excess = correction.black.excess(noise, capture.column("exposure_s")[states])
-        floor = noise.averaged_floor(repeats, excess) + _of_black(capture, model, states, correction.black, noise=noise)
-        slope, floor = noise.slope / repeats / top, floor / top**2
+        slope, floor = noise.slope / repeats / top, noise.averaged_floor(repeats, excess) / top**2
         data = replace(data, slope=slope / side**2, floor=floor / side**2, noise_known=True, noise_source=noise.source)
     stated = capture.sigma
+    if noise is not None and stated is None:
+        data = without_noise_of_darks(data, capture, model, states=states, black=correction.black, noise=noise)
     if stated is not None:
         floor = (stated[states] / top / side) ** 2
         data = replace(
@@ -218,24 +217,6 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     if not data.noise_known and data.usable.sum() >= FEWEST_PIXELS:
         data = estimated_noise(data)
     return without_dark_pixels(data) if data.noise_known else data
-
-
-def _of_black(
-    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], black: Black, *, noise: NoiseModel
-) -> Array:
-    """Noise of each state (N,), counts^2, that leaves in a residual what the noise of the dark frames leaves there.
-
-    It is the same in all states of an exposure: what of that looks like a sample, the fit of one takes up. Mean over
-    the channels.
-    """
-    rows = measurement_matrix(capture, model.model_copy(update={"effects": ()}), states)
-    if capture.header.sample.kind != "unknown":
-        rows = rows @ known_mueller(capture.header.sample).reshape(16, 1)
-    channels, a = rows.shape[1], rows.reshape(-1, rows.shape[2])
-    outside = np.eye(len(a)) - a @ np.linalg.pinv(a)
-    left = outside @ np.repeat(black.weights(capture.column("exposure_s")[states]), channels, axis=0)
-    variance = left**2 @ black.mean_variance(noise) / np.maximum(np.diag(outside), LEAST_OUTSIDE)
-    return np.asarray(variance.reshape(-1, channels).mean(axis=1))
 
 
 def _places_px(model: InstrumentModel, side: int) -> Array | None:
