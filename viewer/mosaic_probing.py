@@ -40,8 +40,8 @@ class SuperPixelReducer:
             self._counts, self._correction = counts_correction(changes, model), CountCorrection.of(capture)
             self._noise = noise_of(capture, states)
             mosaic = capture.header.mosaic or model.mosaic or ()
-            self._layout = MosaicLayout.of(mosaic, [channel.name for channel in model.channels])
             _, self._analyzers = channel_rows(capture, model, states, changes)
+            self._layout = MosaicLayout.of(mosaic, [channel.name for channel in model.channels], self._analyzers)
             self._relative = relative_exposure(capture, states)
 
     def curve(self, region: Region) -> dict[str, Any]:

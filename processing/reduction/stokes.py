@@ -128,12 +128,12 @@ def reduce_stokes(
     if mosaic is None:
         raise CaptureError(f"{capture.path} is not a mosaic capture; it reduces to a Mueller image.")
     require_one_colour(capture)
-    layout = MosaicLayout.of(mosaic, [c.name for c in model.channels])
     left_out = left_out or Exclusions()
     states, cut_off = without_cut_off(capture, left_out.rest_of(sample_states(capture), capture.path))
     cut_off = [*left_out.warnings, *cut_off]
     changes = capture_changes(capture, model, states)
     model_rows, analyzers = channel_rows(capture, model, states, changes)
+    layout = MosaicLayout.of(mosaic, [c.name for c in model.channels], analyzers)
     systematic = _systematic(capture, model, states)
     correction = correction or CountCorrection.of(capture)
     noise = noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)

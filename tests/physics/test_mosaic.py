@@ -17,11 +17,11 @@ from processing.reduction.mosaic.noise import stokes_covariance
 from processing.reduction.stokes import DEFAULT_METHOD, stokes
 
 NAMES = ("0", "45", "90", "135")
-LAYOUT = MosaicLayout.of((("90", "45"), ("135", "0")), NAMES)
 ANGLES = np.deg2rad([0.0, 45.0, 90.0, 135.0])
 FULL = 4095.0
 Scene = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 ANALYZERS = np.array([[0.5, 0.5 * np.cos(2 * t), 0.5 * np.sin(2 * t)] for t in np.deg2rad([0.0, 45, 90, 135])])
+LAYOUT = MosaicLayout.of((("90", "45"), ("135", "0")), NAMES, ANALYZERS)
 METHODS = tuple(demosaicing_methods())
 FULL_SIZE = [m for m in METHODS if m != "superpixel"]
 
@@ -60,7 +60,7 @@ def test_any_arrangement_of_the_super_pixel(method: str) -> None:
     rng = np.random.default_rng(1)
     stokes = np.stack([1000 + 50 * rng.normal(size=(32, 32)), np.full((32, 32), 300.0), np.full((32, 32), -200.0)])
     truth = np.tensordot(ANALYZERS, stokes, axes=1)
-    other = MosaicLayout.of((("0", "135"), ("45", "90")), NAMES)
+    other = MosaicLayout.of((("0", "135"), ("45", "90")), NAMES, ANALYZERS)
     turned = demosaic(mosaic(truth, other), other, method)
     # The same scene turned by 180 degrees has the first arrangement.
     straight = demosaic(mosaic(truth, other)[::-1, ::-1].copy(), LAYOUT, method)[:, ::-1, ::-1]
@@ -274,7 +274,7 @@ def test_bad_layouts_and_frames() -> None:
     with pytest.raises(MosaicError, match="none of bicubic, bilinear"):
         demosaic(np.zeros((8, 8)), LAYOUT, "magic")
     odd = MosaicLayout.of((("a", "b"), ("c", "d")), ("a", "b", "c", "d"))
-    with pytest.raises(MosaicError, match="named by their azimuth"):
+    with pytest.raises(MosaicError, match="analyzers at 0, 45, 90 and 135 degrees"):
         demosaic(np.zeros((8, 8)), odd, "oriented")
     assert demosaic(np.zeros((8, 8)), odd, "bilinear").shape == (4, 8, 8)
 
@@ -282,7 +282,7 @@ def test_bad_layouts_and_frames() -> None:
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 @pytest.mark.parametrize("arrangement", [(("90", "45"), ("135", "0")), (("0", "135"), ("45", "90"))])
 def test_one_pass_equals_the_long_way(dtype: type, arrangement: tuple[tuple[str, ...], ...]) -> None:
-    layout = MosaicLayout.of(arrangement, NAMES)
+    layout = MosaicLayout.of(arrangement, NAMES, ANALYZERS)
     rng = np.random.default_rng(3)
     frame = rng.integers(1, 250, (36, 50)).astype(dtype)
     solve = np.linalg.pinv(ANALYZERS)

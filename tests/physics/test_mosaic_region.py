@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.instrument.model import InstrumentModel
+from processing.reduction.stokes import reduce_stokes
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Detector
+from processing.storage.products.product import Step
 
 LEVEL = {"0": 400, "45": 800, "90": 1200, "135": 1600}
 
@@ -35,3 +39,29 @@ def test_the_diagnosis_reads_each_channel_behind_its_own_analyzer(
         data = read_capture(capture, model)
     means = data.signal.mean(axis=(0, 2, 3)) * (4095 - 64)
     np.testing.assert_allclose(means, [LEVEL[channel.name] for channel in model.channels], rtol=0.02)
+
+
+def test_channels_may_have_any_names(synthetic_capture, configs: Path, tmp_path: Path) -> None:
+    """The default method reads the azimuths of the analyzers from the elements of the instrument."""
+    text = (configs / "instruments" / "linear_stokes.yaml").read_text()
+    renamed = re.sub(r'"(0|45|90|135)"', r"pixel_\1", text)
+    frames = np.random.default_rng(3).integers(500, 2000, (1, 1, 16, 20)).astype(np.uint16)
+    found = []
+    for k, instrument in enumerate((text, renamed)):
+        file = tmp_path / f"{k}.yaml"
+        file.write_text(instrument)
+        model = InstrumentModel.load(file)
+        path = synthetic_capture(
+            frames,
+            {"psg": np.zeros(1)},
+            name=f"{k}.h5",
+            channels=("mosaic",),
+            mosaic=model.mosaic,
+            detector=Detector(black_level_counts=64, gain_e_per_count=2.6, read_noise_e=2.3, bits=12),
+        )
+        out = tmp_path / f"{k}.stokes.h5"
+        with Capture(path) as capture:
+            reduce_stokes(capture, model.at(662.0), out, (Step("reduce", {}),), method="oriented")
+        with h5py.File(out) as h5:
+            found.append(h5["entry/data/s1"][:])
+    np.testing.assert_array_equal(*found)

@@ -8,8 +8,8 @@ from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mosaic.noise import neighbour_correlation, stokes_covariance
 from processing.reflectance.shared_noise import shared_variance
 
-LAYOUT = MosaicLayout.of((("90", "45"), ("135", "0")), ("0", "45", "90", "135"))
 ANALYZERS = 0.5 * np.array([[1.0, 1, 0], [1, 0, 1], [1, -1, 0], [1, 0, -1]])
+LAYOUT = MosaicLayout.of((("90", "45"), ("135", "0")), ("0", "45", "90", "135"), ANALYZERS)
 SOLVE = np.linalg.pinv(ANALYZERS)
 LIGHT, READ = np.array([4000.0, 600, -300]), 2.3
 

@@ -135,7 +135,7 @@ def _design(layout: MosaicLayout, angle: float, stretch: float) -> NDArray[np.fl
 
     around = alike(dy[:, None] - dy, dx[:, None] - dx)
     centre = alike(dy, dx)
-    azimuth = np.deg2rad(layout.azimuths_deg)
+    azimuth = np.deg2rad(layout.four_azimuths_deg())
     sign = np.where(np.cos(4 * azimuth) > 0, 1.0, -1.0)
     fields = 0.5 * np.stack([np.ones(4), np.cos(2 * azimuth), np.sin(2 * azimuth), sign / 2])
     variance = np.array([1.0, _S1_S2, _S1_S2, _CLOSURE])
