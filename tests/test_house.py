@@ -91,7 +91,7 @@ def test_long_tests_are_left_out_with_a_line(two_tests, options):
 
 
 @pytest.mark.parametrize(
-    "options", [("--all", "-n", "2"), ("tests/test_two.py", "-n", "2"), ("-k", "test"), ("-m", "not other")]
+    "options", [("--all", "-n", "2"), ("tests/test_two.py",), ("-k", "test"), ("-m", "not other")]
 )
 def test_what_is_selected_runs_although_it_is_long(two_tests, options):
     said = two_tests(*options)

@@ -40,6 +40,7 @@ def test_a_power_cut_at_any_call_takes_one_reported_state_at_most(tmp_path):
     assert " 0 beyond the bound" in _run("kill_points.py", "power", 0, work=tmp_path)
 
 
+@pytest.mark.long
 def test_in_any_order_of_ends_resumes_and_other_devices_nothing_reported_is_lost(tmp_path, runs):
     _run("capture_life.py", 10 * runs, work=tmp_path)
 
