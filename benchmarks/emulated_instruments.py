@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
 from processing.storage.captures.schema import Detector
-from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
+from processing.storage.formats.import_request import ImportRequest, read_sample
+from processing.storage.formats.importing import import_capture
 
 Array = NDArray[np.float64]
 

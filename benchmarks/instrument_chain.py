@@ -25,7 +25,8 @@ from processing.instrument.model import InstrumentModel
 from processing.public_data.conversion import PublicStates, mirror_means, tables_of
 from processing.public_data.sets import SHIPPED, find_files
 from processing.steps.reduction import Reduction
-from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
+from processing.storage.formats.import_request import ImportRequest, read_sample
+from processing.storage.formats.importing import import_capture
 from processing.storage.products.product import Product
 from processing.yaml_file import dump_yaml
 

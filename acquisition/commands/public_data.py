@@ -44,7 +44,8 @@ def get_command(
     from processing.commands.progress_bar import progress_bar
     from processing.public_data.conversion import tables_of
     from processing.public_data.sets import catalogue, get_files
-    from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
+    from processing.storage.formats.import_request import ImportRequest, read_sample
+    from processing.storage.formats.importing import import_capture
 
     folder = out or Path("data") / name
     with progress_bar(f"getting {name}", "files") as tick:

@@ -104,14 +104,8 @@ def import_command(
     from processing.commands.loaded_late.import_preview import show_understood
     from processing.storage.captures.schema import Detector
     from processing.storage.formats.foreign_arrays import ImportFailed
-    from processing.storage.formats.importing import (
-        ImportRequest,
-        for_item,
-        import_capture,
-        is_imported,
-        name_of_item,
-        read_sample,
-    )
+    from processing.storage.formats.import_request import ImportRequest, for_item, name_of_item, read_sample
+    from processing.storage.formats.importing import import_capture, is_imported
 
     if gain_e_per_count is not None and gain_e_per_count <= 0:
         raise ImportFailed(f"--gain-e-per-count {gain_e_per_count:g}: must be above 0")

@@ -11,7 +11,7 @@ from processing.section import Section
 from processing.yaml_file import dump_yaml, load_yaml
 
 if TYPE_CHECKING:
-    from processing.storage.formats.importing import ImportRequest
+    from processing.storage.formats.import_request import ImportRequest
 
 
 class ImportRecipe(Section):

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from processing.arrays import Array
-from processing.computing.compiling import njit
 from processing.computing.threads import for_ranges
 from processing.errors import ProcessError
 from processing.geometry.rusinkiewicz import Angles
 from processing.instrument.uncertainty import of_all_inputs
 from processing.reflectance.table_axes import SHAPE, Layout, TableAxes
+from processing.reflectance.table_kernels import add_sums, claim_rows, drop_unknown, plane_sums
 from processing.storage.captures.nexus import add_group, add_scales, attach, declare, default_plot, describe_light
 from processing.storage.integrity.h5_door import damage_as, mark_of, open_h5, require_dataset, require_group
 from processing.storage.integrity.packed import LEVEL, Packing
@@ -27,7 +27,6 @@ from processing.storage.products.provenance import Step, read_steps, sign, write
 
 #: 1 had everything in the root, without NeXus groups; up to 2 the errors were quantities with names of their own.
 SCHEMA_VERSION = 3
-
 
 #: Centres of the bins along each axis, degrees.
 AXES = ("theta_h_deg", "theta_d_deg", "phi_d_deg")
@@ -59,7 +58,7 @@ class BinGroups(NamedTuple):
         """Means (..., G) over each group of values (..., N)."""
         flat = np.ascontiguousarray(values.reshape(-1, values.shape[-1]))
         total, square = (np.zeros((len(flat), self.size.size)) for _ in range(2))
-        _add_sums(self.group, flat, total, square, np.zeros_like(self.size))
+        add_sums(self.group, flat, total, square, np.zeros_like(self.size))
         return np.asarray((total / self.size).reshape(*values.shape[:-1], -1))
 
 
@@ -141,11 +140,11 @@ class ScatteringTable:
             v = v.astype(np.float64)
         rows = self._scratch = self.axes.bins(angles, self._scratch).reshape(-1)
         sums = np.empty(len(v))
-        for_ranges(len(v), lambda start, stop: _plane_sums(v, sums, start, stop), align=1, smallest=1)
+        for_ranges(len(v), lambda start, stop: plane_sums(v, sums, start, stop), align=1, smallest=1)
         if not np.all(np.isfinite(sums)):
-            _drop_unknown(rows, v)
+            drop_unknown(rows, v)
         self._claim(rows)
-        _add_sums(rows, v[:quantities], self._sum, self._square, self.count)
+        add_sums(rows, v[:quantities], self._sum, self._square, self.count)
         samples, further = np.flatnonzero(rows >= 0), self._sum[quantities:]
         if uncertainty is None:
             for plane, more in zip(v[quantities:], further, strict=True):
@@ -241,7 +240,7 @@ class ScatteringTable:
     def _claim(self, bins: NDArray[np.int32]) -> None:
         # Replaces each bin by its row, and gives a row to the new ones.
         found = np.empty(bins.size, dtype=np.int32)
-        new = _claim_rows(bins, self._row, self.bins.size, found)
+        new = claim_rows(bins, self._row, self.bins.size, found)
         if new:
             grown = np.zeros((self.planes, new))
             self.bins = np.concatenate([self.bins, found[:new]])
@@ -288,57 +287,23 @@ class ScatteringTable:
     def _lay_out_bins(self, data: h5py.Group, title: str) -> None:
         """What people look at: of each bin that has samples their mean and variance, their number, and its angles."""
         add_scales(data, {"quantity": len(self.quantities)})
-        _put(
-            data,
-            "bin",
-            self.bins,
-            data,
-            dimensions=(),
-            units="",
-            long_name="number of the bin, counted over theta_h, theta_d, phi_d",
-        )
+        text = "number of the bin, counted over theta_h, theta_d, phi_d"
+        _put(data, "bin", self.bins, data, dimensions=(), units="", long_name=text)
         data["bin"].make_scale("bin")
         data["quantity_name"] = np.array([name.encode() for name in self.quantities], dtype="S")
         attach(data["quantity_name"], data, ["quantity"])
         _put(data, "count", self.count, data, dimensions=["bin"], units="", long_name="samples in the bin")
         for name, angle in zip(AXES, self.axes.angles(self.bins), strict=True):
-            _put(
-                data,
-                name,
-                np.rad2deg(angle).round(9),
-                data,
-                dimensions=["bin"],
-                units="degree",
-                long_name="centre of the bin",
-            )
-        _put(
-            data,
-            "mean",
-            self.mean,
-            data,
-            dimensions=("quantity", "bin"),
-            units=self.units,
-            long_name="mean of the samples in the bin",
-        )
-        _put(
-            data,
-            "sample_variance",
-            self.variance,
-            data,
-            dimensions=("quantity", "bin"),
-            units="",
-            long_name="variance of the samples in the bin",
-        )
+            degrees, text = np.rad2deg(angle).round(9), "centre of the bin"
+            _put(data, name, degrees, data, dimensions=["bin"], units="degree", long_name=text)
+        planes = {
+            "mean": (self.mean, self.units, "mean of the samples in the bin"),
+            "sample_variance": (self.variance, "", "variance of the samples in the bin"),
+        }
         for name, values in self.uncertainties.items():
-            _put(
-                data,
-                name,
-                values.astype(np.float32),
-                data,
-                dimensions=("quantity", "bin"),
-                units=self.units,
-                long_name=UNCERTAINTIES[name],
-            )
+            planes[name] = values.astype(np.float32), self.units, UNCERTAINTIES[name]
+        for name, (plane, units, text) in planes.items():
+            _put(data, name, plane, data, dimensions=("quantity", "bin"), units=units, long_name=text)
         if self.inputs:
             add_scales(data, {"input": len(self.inputs)})
             data["input_name"] = np.array([name.encode() for name in self.inputs], dtype="S")
@@ -361,11 +326,9 @@ class ScatteringTable:
             if "umov_table" not in h5.attrs:
                 raise TableError(f"{path} is no scattering table. `process table` makes one.")
             a = h5.attrs
-            if int(a["umov_table"]) > SCHEMA_VERSION:
-                raise TableError(
-                    f"{path} has table version {a['umov_table']}; this program reads up to {SCHEMA_VERSION}."
-                )
             version = int(a["umov_table"])
+            if version > SCHEMA_VERSION:
+                raise TableError(f"{path} has table version {version}; this program reads up to {SCHEMA_VERSION}.")
             data, sums = (h5 if version == 1 else require_group(h5, f"entry/{name}") for name in ("data", "sums"))
             names = [str(q) for q in a["quantities"]]
             quantities, has_noise, inputs = names, "u_noise" in data, [str(i) for i in a.get("inputs", ())]
@@ -435,90 +398,3 @@ def _put(
 
 def _kind(simulated: bool) -> str:
     return "simulated" if simulated else "measured"
-
-
-@njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
-def _plane_sums(values, out, start, stop):  # type: ignore[no-untyped-def]
-    # Finite when every value is: far quicker than to look at each pixel.
-    for c in range(start, stop):
-        total = values.dtype.type(0)
-        for n in range(values.shape[1]):
-            total += values[c, n]
-        out[c] = total
-
-
-@njit(nogil=True, cache=True)
-def _drop_unknown(rows, values):  # type: ignore[no-untyped-def]
-    for n in range(rows.size):
-        total = 0.0
-        for c in range(values.shape[0]):
-            total += values[c, n]
-        if not np.isfinite(total):
-            rows[n] = -1
-
-
-@njit(cache=True)
-def _claim_rows(bins, row_of_bin, used, found):  # type: ignore[no-untyped-def]
-    # Replaces each bin by its row in the sparse arrays; new bins get the next rows.
-    new = 0
-    for n in range(bins.size):
-        b = bins[n]
-        if b < 0:
-            continue
-        r = row_of_bin[b]
-        if r < 0:
-            r = used + new
-            row_of_bin[b] = r
-            found[new] = b
-            new += 1
-        bins[n] = r
-    return new
-
-
-def _add_sums(
-    rows: NDArray[np.int32], values: NDArray[np.floating], total: Array, square: Array, count: NDArray[np.int64]
-) -> None:
-    """Add values (Q, N), their squares and their number to the row (Q, rows) of each sample."""
-    for_ranges(
-        (len(values) + 3) // 4,
-        lambda start, stop: _accumulate(rows, values, total, square, count, start, stop),
-        align=1,
-        smallest=1,
-    )
-
-
-@njit(nogil=True, cache=True, fastmath={"contract"})
-def _accumulate(rows, values, total, square, count, start, stop):  # type: ignore[no-untyped-def]
-    # Four quantities a thread: no two threads write to one place, and the eight sums do not wait for each
-    # other. A run of pixels in one bin, the rule in an image, stays in registers.
-    quantities = values.shape[0]
-    for group in range(start, stop):
-        first = 4 * group
-        c1, c2, c3 = min(first + 1, quantities - 1), min(first + 2, quantities - 1), min(first + 3, quantities - 1)
-        v0, v1, v2, v3 = values[first], values[c1], values[c2], values[c3]
-        last, k = -1, 0
-        s0 = s1 = s2 = s3 = q0 = q1 = q2 = q3 = 0.0
-        for n in range(rows.size + 1):
-            r = rows[n] if n < rows.size else -1
-            if r != last:
-                if last >= 0:
-                    total[first, last] += s0
-                    square[first, last] += q0
-                    if c1 == first + 1:
-                        total[c1, last] += s1
-                        square[c1, last] += q1
-                    if c2 == first + 2:
-                        total[c2, last] += s2
-                        square[c2, last] += q2
-                    if c3 == first + 3:
-                        total[c3, last] += s3
-                        square[c3, last] += q3
-                    if group == 0:
-                        count[last] += k
-                last, k = r, 0
-                s0 = s1 = s2 = s3 = q0 = q1 = q2 = q3 = 0.0
-            if r >= 0:
-                a, b, c, d = np.float64(v0[n]), np.float64(v1[n]), np.float64(v2[n]), np.float64(v3[n])
-                s0, s1, s2, s3 = s0 + a, s1 + b, s2 + c, s3 + d
-                q0, q1, q2, q3 = q0 + a * a, q1 + b * b, q2 + c * c, q3 + d * d
-                k += 1

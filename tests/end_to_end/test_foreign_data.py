@@ -12,7 +12,7 @@ from processing.instrument.elements import Diattenuator, Polarizer, Retarder
 from processing.instrument.measured import MeasuredMatrix
 from processing.instrument.model import Channel, InstrumentModel
 from processing.storage.captures.capture import Capture
-from processing.storage.formats.importing import name_of_item
+from processing.storage.formats.import_request import name_of_item
 from processing.storage.products.images import MuellerImage
 
 ROOT = Path(__file__).resolve().parents[2]

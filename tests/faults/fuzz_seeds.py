@@ -31,7 +31,8 @@ from processing.reflectance.tables import ScatteringTable
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import CaptureHeader, create_layout, write_closing
 from processing.storage.formats.axostep import read_mueller_file, read_rmmd
-from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
+from processing.storage.formats.import_request import ImportRequest, read_sample
+from processing.storage.formats.importing import import_capture
 from processing.storage.formats.tensor_file import create_tensor_file, read_tensor_file
 from processing.storage.products.product import Product, Step
 from simulators.bench.scene import Scene

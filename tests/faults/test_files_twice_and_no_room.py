@@ -16,7 +16,8 @@ from processing.commands.diagnose import main as diagnose
 from processing.errors import ProcessError
 from processing.storage.captures.schema import CaptureHeader, Detector
 from processing.storage.formats.foreign_arrays import ImportFailed
-from processing.storage.formats.importing import ImportRequest, import_capture
+from processing.storage.formats.import_request import ImportRequest
+from processing.storage.formats.importing import import_capture
 from processing.storage.products.product import Plane, ProductError, ProductWriter
 
 TWICE = {

@@ -11,7 +11,8 @@ from processing.reduction.mueller import reduce_mueller
 from processing.reduction.mueller_reduction import Choice
 from processing.storage.captures.capture import Capture
 from processing.storage.formats.foreign_arrays import ImportFailed
-from processing.storage.formats.importing import ImportRequest, import_capture
+from processing.storage.formats.import_request import ImportRequest
+from processing.storage.formats.importing import import_capture
 from processing.storage.formats.state_csv import read_states
 from processing.storage.products.images import MuellerImage
 

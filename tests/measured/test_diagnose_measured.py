@@ -18,7 +18,8 @@ from processing.instrument.model import InstrumentModel
 from processing.public_data.conversion import PublicStates, mirror_means, single_detector, tables_of
 from processing.public_data.sets import SHIPPED
 from processing.storage.captures.capture import Capture
-from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
+from processing.storage.formats.import_request import ImportRequest, read_sample
+from processing.storage.formats.importing import import_capture
 
 pytestmark = pytest.mark.measured
 

@@ -8,7 +8,8 @@ import pytest
 from processing.public_data.sets import SHIPPED
 from processing.reduction.stokes import reduce_stokes
 from processing.storage.captures.capture import Capture
-from processing.storage.formats.importing import ImportRequest, import_capture
+from processing.storage.formats.import_request import ImportRequest
+from processing.storage.formats.importing import import_capture
 from processing.storage.products.images import StokesImage
 from processing.storage.products.product import Product, Step
 

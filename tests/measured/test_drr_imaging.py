@@ -12,7 +12,8 @@ from processing.instrument.model import InstrumentModel
 from processing.public_data.conversion import tables_of
 from processing.reduction.mueller import reduce_mueller
 from processing.storage.captures.capture import Capture
-from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
+from processing.storage.formats.import_request import ImportRequest, read_sample
+from processing.storage.formats.importing import import_capture
 from processing.storage.products.images import MuellerImage
 from processing.storage.products.product import Step
 

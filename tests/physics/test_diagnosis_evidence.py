@@ -5,7 +5,8 @@ import pytest
 
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.instrument.model import InstrumentModel
-from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
+from processing.storage.formats.import_request import ImportRequest, read_sample
+from processing.storage.formats.importing import import_capture
 from simulators.blind.undeclared_captures import state_angles
 
 STATES = 24

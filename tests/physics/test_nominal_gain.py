@@ -6,7 +6,8 @@ import pytest
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument_file import write_instrument
 from processing.instrument.model import InstrumentModel
-from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
+from processing.storage.formats.import_request import ImportRequest, read_sample
+from processing.storage.formats.importing import import_capture
 from processing.yaml_file import dump_yaml
 
 GAINS = {"45": 0.93, "90": 1.22, "135": 0.84}

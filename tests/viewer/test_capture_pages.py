@@ -8,7 +8,8 @@ import pytest
 
 from processing.instrument.model import InstrumentModel
 from processing.steps.reduction import Reduction
-from processing.storage.formats.importing import ImportRequest, import_capture
+from processing.storage.formats.import_request import ImportRequest
+from processing.storage.formats.importing import import_capture
 from processing.storage.products.product import Product
 
 

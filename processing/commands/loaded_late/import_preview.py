@@ -7,7 +7,8 @@ from itertools import islice
 import numpy as np
 import typer
 
-from processing.storage.formats.importing import ImportRequest, understand
+from processing.storage.formats.import_request import ImportRequest
+from processing.storage.formats.importing import understand
 
 #: Most frames in the strip and rows in the table.
 SHOWN = 12
