@@ -12,11 +12,10 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Literal, Self
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from drivers.errors import CameraError, FrameLost
+from drivers.frame import Frame, FrameAverage
 from drivers.top_of_counts import TopOfCounts
 
 log = logging.getLogger(__name__)
@@ -47,32 +46,6 @@ class CameraSettings(BaseModel):
     trigger: Literal["software", "hardware"] | None = Field(
         default=None, description="hardware: the signal at trigger_line starts each exposure; software if never set"
     )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Frame:
-    """One whole frame.
-
-    Attributes
-    ----------
-    pixels : ndarray of uint16, shape (height, width)
-        Counts, right-aligned to the camera's real bits; owned by the frame, read-only.
-    frame_id : int
-        The camera's number of the frame; of the last one where several were averaged.
-    camera_time_ns : int
-        The camera's own clock, in nanoseconds from its own zero: at the exposure where it tells that, else at the
-        transfer; 0 for a camera without a clock.
-    host_time_s : float
-        Unix time at which the software trigger was sent; with a hardware trigger, at which the first packet came.
-    complete : bool
-        Always True for a frame that a camera hands out.
-    """
-
-    pixels: NDArray[np.uint16]
-    frame_id: int
-    camera_time_ns: int
-    host_time_s: float
-    complete: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +110,7 @@ class CameraIdentity:
 class Exposure:
     """One exposure under way, made by `Camera.trigger`."""
 
-    def __init__(self, camera: Camera, earlier: _Average | None) -> None:
+    def __init__(self, camera: Camera, earlier: FrameAverage | None) -> None:
         self._camera = camera
         self._earlier = earlier
         self._exposed = False
@@ -175,42 +148,6 @@ class Exposure:
             return frame
         self._earlier.add(frame)
         return self._earlier.result()
-
-
-class _Average:
-    """Mean of several frames; a pixel that was saturated once stays saturated, so that masks still see it."""
-
-    def __init__(self, top: TopOfCounts) -> None:
-        self._top = top
-        self._frames = 0
-        self._last: Frame | None = None
-
-    def add(self, frame: Frame) -> None:
-        """Add a frame. Raises FrameLost for one that equals the frame before; frames of one value are not judged."""
-        pixels = frame.pixels
-        if self._last is not None and np.array_equal(pixels, self._last.pixels) and pixels.min() != pixels.max():
-            raise FrameLost(
-                "camera, frame of an average",
-                "it is the same, pixel by pixel, as the one before: the camera or its driver is frozen",
-                "Switch the camera off and on",
-            )
-        if self._last is None:
-            self._sum = frame.pixels.astype(np.uint32)
-            # The largest of each pixel, because the top may be learnt from a later frame.
-            self._largest = frame.pixels.copy()
-            self._host_time_s = frame.host_time_s
-        else:
-            self._sum += frame.pixels
-            np.maximum(self._largest, frame.pixels, out=self._largest)
-        self._frames += 1
-        self._last = frame
-
-    def result(self) -> Frame:
-        mean = ((self._sum + self._frames // 2) // self._frames).astype(np.uint16)
-        mean[self._largest >= self._top.counts] = self._top.counts
-        mean.flags.writeable = False
-        assert self._last is not None
-        return Frame(mean, self._last.frame_id, self._last.camera_time_ns, self._host_time_s)
 
 
 class Camera(ABC):
@@ -326,7 +263,7 @@ class Camera(ABC):
         """
         self._require_open()
         frames = self.settings.frame_average or 1
-        earlier = _Average(self.top_of_counts) if frames > 1 else None
+        earlier = FrameAverage(self.top_of_counts) if frames > 1 else None
         if earlier is not None:
             for _ in range(frames - 1):
                 earlier.add(self._whole_frame(None))
@@ -347,7 +284,7 @@ class Camera(ABC):
         average = self.settings.frame_average or 1
         frames = []
         for _ in range(count):
-            mean = _Average(self.top_of_counts) if average > 1 else None
+            mean = FrameAverage(self.top_of_counts) if average > 1 else None
             for _ in range(average):
                 frame = self._whole_frame(mean)
             frames.append(frame if mean is None else mean.result())
@@ -358,7 +295,7 @@ class Camera(ABC):
         self.top_of_counts.look(frame.pixels)
         return frame
 
-    def _whole_frame(self, mean: _Average | None) -> Frame:
+    def _whole_frame(self, mean: FrameAverage | None) -> Frame:
         for attempt in range(self._allowed_retakes + 1):
             self._do_trigger()
             try:

@@ -11,8 +11,9 @@ from acquisition.capture.repeated_state import RepeatedState
 from acquisition.errors import RunFailed
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import StateReport
-from drivers.camera import CameraSettings, Frame
+from drivers.camera import CameraSettings
 from drivers.errors import FrameLost
+from drivers.frame import Frame
 from drivers.motion import Position
 from processing.arrays import Array
 from processing.reduction.frame_evidence import FrameEvidence

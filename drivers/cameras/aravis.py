@@ -20,10 +20,11 @@ from drivers.aravis_identity import identify
 from drivers.aravis_library import load_aravis, open_camera
 from drivers.aravis_setup import Config, Setup, structure_of
 from drivers.aravis_stream import Arrival, FrameStream, let_go
-from drivers.camera import Camera, CameraIdentity, CameraSettings, Frame, StreamStatistics
+from drivers.camera import Camera, CameraIdentity, CameraSettings, StreamStatistics
 from drivers.camera_clock import CameraClock
 from drivers.clock import REAL, Clock
 from drivers.errors import CameraError, FrameLost
+from drivers.frame import Frame
 from drivers.genicam import Features
 from drivers.pixel_formats import PixelFormat
 

@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from drivers.camera import Camera, CameraIdentity, CameraSettings, Frame, StreamStatistics
+from drivers.camera import Camera, CameraIdentity, CameraSettings, StreamStatistics
 from drivers.clock import REAL, Clock
 from drivers.errors import CameraBusy, CameraLost, CameraNotFound, FrameLost, SettingRefused
+from drivers.frame import Frame
 from drivers.micromanager import NOT_TOLD, asking, loaded_devices, running_core
 
 # Ctrl-C gets through between two looks.

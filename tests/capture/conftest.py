@@ -13,8 +13,9 @@ import pytest
 
 from acquisition.capture.runner import CaptureRunner
 from acquisition.stop_request import StopRequest
-from drivers.camera import CameraSettings, Frame
+from drivers.camera import CameraSettings
 from drivers.errors import FrameLost
+from drivers.frame import Frame
 from drivers.motion import Position
 from processing.instrument.states import StateTable
 from processing.storage.captures.schema import Detector

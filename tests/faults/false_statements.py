@@ -31,8 +31,8 @@ from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
 from drivers import genicam
-from drivers.camera import Frame
 from drivers.errors import DeviceError
+from drivers.frame import Frame
 from processing.reduction.counts_to_signal import CountCorrection
 from processing.storage.captures.capture import Capture
 
