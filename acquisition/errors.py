@@ -11,7 +11,17 @@ from processing.errors import ProcessError
 
 
 class AcquisitionError(Exception):
-    """A run cannot start or go on; the message says what was asked, what came back and what to do."""
+    """A run cannot start or go on; the message says what was asked, what came back and what to do.
+
+    Examples
+    --------
+    >>> from acquisition import AcquisitionError, MeasurementPlan, load_rig, take_capture
+    >>> try:
+    ...     take_capture(MeasurementPlan(mode="no_such_mode"), load_rig("rig.yaml"), "captures")
+    ... except AcquisitionError as error:
+    ...     "no_such_mode" in str(error)
+    True
+    """
 
 
 class PlanRefused(AcquisitionError):

@@ -27,18 +27,32 @@ def take_capture(
 
     Parameters
     ----------
-    folder
+    plan : MeasurementPlan
+    rig : RigConfig
+    folder : path or str
         For the file, which is named as `acquire` names it.
-    home
+    home : bool
         Home axes without a reference before the first move; nothing homes unless asked here or by the rig file.
+    observers : sequence of Observer
+        Hear of each step, as the progress bar of `acquire` does.
 
-    observers
-        Are told what happens, as the progress bar of `acquire` is.
+    Returns
+    -------
+    Path
+        The sealed capture.
 
     Raises
     ------
     AcquisitionError, DeviceError
         It was refused, failed or was stopped; the message names what is left to go on with.
+
+    Examples
+    --------
+    >>> from acquisition import MeasurementPlan, load_rig, take_capture
+    >>> plan = MeasurementPlan.load("plans/stokes.yaml").with_changes(exposure_s=0.001)
+    >>> with Capture(take_capture(plan, load_rig("rig.yaml"), "captures")) as capture:
+    ...     capture.header.mode, capture.simulated, len(capture.role)
+    ('stokes', True, 12)
     """
     job = prepare(plan, rig)
     with StopRequest() as stop, open_rig(rig) as devices:

@@ -59,6 +59,13 @@ class Campaign(FiniteSection):
     `exposure_s` is one value, or one for each wavelength in nm, or {kind: auto}. `retries` is how often a capture
     that a device or the disc ended is gone on with unattended, axes opened anew and without asking whether they are
     free: 0 where somebody should look first.
+
+    Examples
+    --------
+    >>> from acquisition import Campaign
+    >>> campaign = Campaign.load("campaigns/red_sphere.yaml")
+    >>> campaign.name, campaign.wavelengths_nm
+    ('red_sphere', (451.0, 662.0))
     """
 
     kind: Literal["campaign"] = "campaign"

@@ -133,6 +133,13 @@ class MeasurementPlan(FiniteSection):
     Darks come first: the shutter is closed, the axes stand in the pose of the first state. `repeats` frames are
     averaged for each state. `bracket` lists factors on the exposure, for instance (1, 8): every pose is taken with
     each, darks too, as states of their own; the reduction uses of each pixel what is not saturated.
+
+    Examples
+    --------
+    >>> from acquisition import MeasurementPlan
+    >>> plan = MeasurementPlan(omega_deg=35, wavelength_nm=662)
+    >>> plan.mode, plan.exposure_s, plan.darks
+    ('drr', 0.02, 4)
     """
 
     kind: Literal["plan"] = "plan"

@@ -20,7 +20,15 @@ from simulators.rig.model import SCHEME
 
 
 class RigConfig(RigSections):
-    """A rig whose sections fit together. Relative paths are relative to the rig file."""
+    """A rig whose sections fit together. Relative paths are relative to the rig file.
+
+    Examples
+    --------
+    >>> from acquisition import load_rig
+    >>> rig = load_rig("rig.yaml")
+    >>> rig.name, sorted(rig.modes), rig.simulator is not None
+    ('simulated RGB950', ['drr', 'stokes'], True)
+    """
 
     @model_validator(mode="wrap")
     @classmethod
@@ -87,7 +95,27 @@ def _details(where: tuple[int | str, ...], why: str) -> InitErrorDetails:
 
 
 def load_rig(path: Path | str) -> RigConfig:
-    """Read a rig file; its relative paths become absolute. Raises ConfigError with file, line and key."""
+    """Read a rig file; its relative paths become absolute.
+
+    Parameters
+    ----------
+    path : path or str
+
+    Returns
+    -------
+    RigConfig
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or does not fit; the message has file, line and key.
+
+    Examples
+    --------
+    >>> from acquisition import load_rig
+    >>> load_rig("rig.yaml").axes["arm"].kind
+    'smc100'
+    """
     path = Path(path)
     rig = load_yaml(path, RigConfig)
     folder = path.resolve().parent

@@ -65,6 +65,13 @@ class Rig(JointAxes):
     ----------
     ask
         Shows the operator what a source without a cable needs and returns True when it is done.
+
+    Examples
+    --------
+    >>> from acquisition import Rig, load_rig, open_rig
+    >>> with open_rig(load_rig("rig.yaml"), with_camera=False) as rig:
+    ...     isinstance(rig, Rig), rig.source.is_on(), rig.camera
+    (True, False, None)
     """
 
     def __init__(

@@ -65,6 +65,14 @@ class SimulatedBench:
     seed : int
     effects : sequence of BenchEffect
         What happens on the bench besides; applied in this order within a stage.
+
+    Examples
+    --------
+    >>> from acquisition import Scene, SimulatedBench
+    >>> optics = InstrumentModel.load("instrument.yaml")
+    >>> bench = SimulatedBench(Scene.load("scenes/air.yaml"), optics, 662, rows=24, columns=32)
+    >>> bench.expose({"psg": 0.0, "psa": 0.0}, 0.02, index=0, light=False).shape
+    (24, 32)
     """
 
     def __init__(

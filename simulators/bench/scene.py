@@ -108,7 +108,15 @@ class SceneTruth:
 
 
 class Scene:
-    """A scene that answers with true Mueller images, in the instrument frames, throughput included."""
+    """A scene that answers with true Mueller images, in the instrument frames, throughput included.
+
+    Examples
+    --------
+    >>> from acquisition import Scene
+    >>> scene = Scene.load("scenes/air.yaml")
+    >>> scene.mueller_image(omega_deg=180, wavelength_nm=662, rows=24, columns=32).shape
+    (24, 32, 4, 4)
+    """
 
     def __init__(self, spec: AnyScene, material: ReflectanceModel | None = None) -> None:
         if isinstance(spec, ObjectScene) and material is None:

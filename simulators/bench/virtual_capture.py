@@ -36,6 +36,15 @@ def write_virtual_capture(
     Raises
     ------
     ValueError : the instrument turns other axes than psg and psa.
+
+    Examples
+    --------
+    >>> from acquisition import Scene, SimulatedBench, write_virtual_capture
+    >>> declared = InstrumentModel.load("instrument.yaml")
+    >>> bench = SimulatedBench(Scene.load("scenes/air.yaml"), declared, 662, rows=24, columns=32)
+    >>> write_virtual_capture(Path("virtual.h5"), bench, declared, omega_deg=180)
+    >>> len(Capture("virtual.h5").role)
+    44
     """
     axes = instrument.axes
     psg = RGB950_STEP_DEG * np.arange(states)
