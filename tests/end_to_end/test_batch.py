@@ -52,7 +52,8 @@ def results(lines: list[str]) -> list[tuple[str, str]]:
 @pytest.mark.parametrize(
     ("command", "kind", "options"),
     [("reduce", "mueller.h5", ["--no-figure"]), ("xi0", "xi0.h5", ["--no-figure"]),
-     *(("export", to, ["--to", to]) for to in ("png", "csv", "fits"))],
+     pytest.param("export", "png", ["--to", "png"], marks=pytest.mark.long),
+     *(("export", to, ["--to", to]) for to in ("csv", "fits"))],
 )  # fmt: skip
 def test_a_folder_twice_makes_nothing_twice(command, kind, options, lab, process):
     names = [f"{stem}.{kind}" for stem in ("one_2", "one_10", "other")]

@@ -1,12 +1,16 @@
 """Slips of a user: a device that is not plugged in, names and files that are not meant so. One clear message each."""
 
+import shutil
+from pathlib import Path
+
 import h5py
 import pytest
 
+from acquisition.commands.application import main as acquire_main
 from processing.campaign.captures import find_captures
 from processing.commands.application import main as process
 from processing.commands.diagnose import main as diagnose
-from tests.rig_files import change_yaml
+from tests.rig_files import change_yaml, write_rig
 
 
 @pytest.fixture
@@ -35,11 +39,20 @@ def run(capfd):
     return done
 
 
-@pytest.fixture
-def capture(acquire, small_rig, tmp_path):
-    acquire("--omega", 35, "--rig", small_rig(), "--out", tmp_path)
-    (path,) = tmp_path.glob("*omega35.h5")
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory, configs):
+    folder = tmp_path_factory.mktemp("taken")
+    with pytest.raises(SystemExit) as end:
+        acquire_main(["--omega", "35", "--rig", str(write_rig(configs, folder / "rig.yaml")), "--out", str(folder)])
+    assert not end.value.code
+    (path,) = folder.glob("*omega35.h5")
     return path
+
+
+@pytest.fixture
+def capture(taken, tmp_path):
+    """A capture that a test may lose, alone in its folder."""
+    return Path(shutil.copy(taken, tmp_path))
 
 
 def test_options_that_do_not_fit_are_told_before_the_work_and_not_passed_over(run, capture):
@@ -125,7 +138,6 @@ def test_a_table_of_the_user_is_not_replaced_by_a_design(run, configs, tmp_path)
     assert table.read_text() == "psg,psa\n0,0\n"
 
 
-@pytest.mark.long
 def test_a_file_that_is_not_meant_is_called_what_it_is(run, acquire, capture, configs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text, folder, product = tmp_path / "notes.txt", tmp_path / "empty", tmp_path / "näme with blanks.h5"

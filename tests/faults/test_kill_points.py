@@ -31,6 +31,7 @@ def _run(program, *arguments, work):
     return done.stdout
 
 
+@pytest.mark.long
 def test_killed_at_a_sample_of_calls_the_same_command_goes_on(tmp_path):
     # One while the file is laid out, one among its states.
     assert "0 with something lost" in _run("kill_points.py", "kill", 90, 60, work=tmp_path)

@@ -4,9 +4,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 FUZZ = Path(__file__).with_name("fuzz_doors.py")
 
 
+@pytest.mark.long
 def test_random_damage_at_every_door():
     """A fixed seed and few inputs; CI itself gives each door half a minute (.ci/run)."""
     command = [sys.executable, str(FUZZ), "--inputs", "15", "--seed", "20"]

@@ -21,6 +21,7 @@ def _moving(simulation):
     return [axis.is_moving() for emulator in simulation.emulators.values() for axis in emulator.axes]
 
 
+@pytest.mark.long
 def test_once_finishes_the_state_parks_and_seals_and_the_capture_goes_on(spawn, partial_of, served, intact, tmp_path):
     simulation, rig = served
     child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out")
