@@ -52,16 +52,6 @@ class Demo:
     folder: Path
     seconds: float
 
-    @property
-    def wrong_names(self) -> tuple[FoundEffect, ...]:
-        """Effects that are named as sure, of which neither the name nor an equal alternative is a drawn fault."""
-        true = {kind for fault in self.faults for kind in (fault.kind, *FAULTS[fault.kind].implies)}
-        return tuple(
-            e
-            for e in self.judged.diagnosis.effects
-            if e.confident and e.answer == "sure" and not true & {e.kind, *_kinds(e.indistinguishable_from)}
-        )
-
     def found_for(self, fault: DrawnFault) -> tuple[FoundEffect, ...]:
         """Effects found for a drawn fault: by its name, or else with its name among the equal alternatives."""
         effects = self.judged.diagnosis.effects

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from processing.geometry.camera_pose import Board, calibrate
 from processing.geometry.errors import GeometryError, OutlineNotFound
@@ -14,7 +15,6 @@ from processing.geometry.pinhole import PinholeCamera
 from processing.geometry.pose import refine_pose
 from processing.geometry.sphere import Sphere
 from processing.geometry.viewing import ViewingGeometry
-from simulators.bench.meshes import write_bumpy_body
 from simulators.bench.scene import Scene
 
 CAMERA = PinholeCamera(rows=200, columns=220, pixel_mm=0.0353, focal_length_mm=60, distance_mm=262.7)
@@ -22,8 +22,13 @@ CAMERA = PinholeCamera(rows=200, columns=220, pixel_mm=0.0353, focal_length_mm=6
 
 @pytest.fixture(scope="module")
 def bumpy(tmp_path_factory) -> str:
+    """A closed, asymmetric body of about the size of the sphere."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
+    x, y, z = ball.vertices.T
+    bumps = 1 + 0.12 * np.sin(3 * x + 1) * np.cos(2 * y) + 0.10 * x * y + 0.08 * np.sin(4 * y + 2 * z)
+    ball.vertices = ball.vertices * (12.0 * bumps)[:, None] * np.array([1.0, 0.85, 0.9])
     path = tmp_path_factory.mktemp("mesh") / "bumpy.stl"
-    write_bumpy_body(path, subdivisions=3)
+    ball.export(path)
     return str(path)
 
 
