@@ -171,6 +171,16 @@ def test_a_page_that_speaks_of_the_paper_names_it():
     assert [page.name for page in pages if "Jarecki" not in page.read_text("utf-8")] == []
 
 
+def test_the_table_of_devices_names_a_document_of_every_kind():
+    rows = re.findall(r"^\| ([\w, ]+) \| (.+?) \| .+ \|$", (ROOT / "docs/devices.md").read_text("utf-8"), re.MULTILINE)
+    named = {kind for kinds, document in rows if document.strip("-") for kind in kinds.split(", ")}
+    kinds = {
+        file.stem for family in ("axes", "cameras", "sources") for file in (ROOT / "drivers" / family).glob("[!_]*.py")
+    }
+    # A lamp without a cable has no protocol.
+    assert kinds - named == {"manual"}
+
+
 def test_every_page_of_the_docs_is_in_the_site():
     named = set(re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
     pages = {str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")}
