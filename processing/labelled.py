@@ -31,6 +31,19 @@ def open_dataset(path: Path | str) -> xr.Dataset:
     standard errors. Every variable has `units` and `long_name`; attributes hold title, wavelength, Omega, and whether
     the data are simulated.
 
+    Parameters
+    ----------
+    path : path or str
+
+    Returns
+    -------
+    xarray.Dataset
+
+    Raises
+    ------
+    ProcessError
+        The file is neither a capture nor a product, or it is damaged.
+
     Examples
     --------
     >>> counts = open_dataset("sphere.h5").counts
@@ -233,10 +246,16 @@ def reduce_to_dataset(capture: Path | str, instrument: Path | str | None = None,
 
     Parameters
     ----------
-    instrument
+    capture : path or str
+    instrument : path, str or None
         File to use instead of the model in the capture.
     options
         Of `processing.Reduction`, for instance `weighted=True`.
+
+    Returns
+    -------
+    xarray.Dataset
+        As `open_dataset` gives it for a product, in counts.
 
     Raises
     ------
@@ -255,10 +274,21 @@ def reduce_to_dataset(capture: Path | str, instrument: Path | str | None = None,
 
 
 def write_dataset(dataset: xr.Dataset, path: Path | str) -> Path:
-    """Write a Dataset as `open_dataset` gives it for a capture into a capture file; returns the path.
+    """Write a Dataset as `open_dataset` gives it for a capture into a capture file.
 
     Needed are `counts` (state, channel, y, x), one `AXIS_deg` (state) for each axis that turned, and the attribute
     `header` (JSON of a `CaptureHeader`) or `wavelength_nm` and `title`. Without `role` all states are of the sample.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Counts; angles in degrees, exposures in seconds.
+    path : path or str
+
+    Returns
+    -------
+    Path
+        Of the file.
 
     Raises
     ------

@@ -187,12 +187,21 @@ def free_design(
 
     Parameters
     ----------
-    model
+    model : InstrumentModel
         Resolved at a wavelength, without effects.
-    free_retardances
+    states : int
+    goal : Goal or None
+        What is to be small; None: the equally weighted variance.
+    free_retardances : bool
         Those of turning retarders may change too.
-    first
+    first : mapping of axis to array (states,), or None
         A table to start from besides, degrees.
+    progress : callable or None
+        Called with (starts done, starts in all).
+
+    Returns
+    -------
+    FreeDesign
 
     Raises
     ------

@@ -65,7 +65,11 @@ def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis, n
 
     Parameters
     ----------
-    note
+    path : Path
+    model : InstrumentModel
+        All wavelengths, as it was diagnosed.
+    diagnosis : Diagnosis
+    note : str
         Why it is believed, for the head of the file.
 
     Raises

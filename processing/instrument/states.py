@@ -79,14 +79,21 @@ def rotating_retarders(
 
     Parameters
     ----------
-    exposure_s
+    exposure_s : float
         Of every state, seconds.
-    step_deg
+    states : int
+    step_deg : float
         Between two states of the first axis, which begins at 0 degrees; the defaults are RGB950's table.
-    repeats
+    ratio : float
+        Turn of the second axis over that of the first.
+    repeats : int
         Frames averaged for each state.
-    axes
+    axes : tuple of str
         Names of the generator's and the analyzer's axis.
+
+    Returns
+    -------
+    StateTable
 
     Examples
     --------

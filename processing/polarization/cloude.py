@@ -46,8 +46,17 @@ def coherency_eigenvalues(m: RealArray) -> RealArray:
 def cloude(m: RealArray) -> Cloude:
     """All four eigenvalues and Mueller-Jones matrices of Mueller matrices (..., 4, 4).
 
-    Values and NaN as in `coherency_eigenvalues`. Where eigenvalues are equal their matrices are one choice of
-    many (any basis of their common space); an exact ideal depolarizer has none and gets NaN.
+    Where eigenvalues are equal their matrices are one choice of many (any basis of their common space); an exact ideal
+    depolarizer has none and gets NaN.
+
+    Parameters
+    ----------
+    m : array (..., 4, 4)
+
+    Returns
+    -------
+    Cloude
+        Values and NaN as in `coherency_eigenvalues`.
 
     Examples
     --------

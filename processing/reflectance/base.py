@@ -109,7 +109,21 @@ def kinds() -> dict[str, type[BaseModel]]:
 
 
 def load_reflectance(path: Path | str) -> Any:
-    """The ReflectanceModel that a material file describes. Raises ConfigError with file, line and key.
+    """The model that a material file describes.
+
+    Parameters
+    ----------
+    path : path or str
+
+    Returns
+    -------
+    ReflectanceModel
+        Of the kind that the file names.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or does not fit; the message has file, line and key.
 
     Examples
     --------

@@ -30,12 +30,23 @@ def write_virtual_capture(
 
     Parameters
     ----------
-    bench : with its scene, true optics and wavelength.
-    instrument : the model declared in the file, all wavelengths; with a mosaic, every state is alike.
+    path : Path
+    bench : SimulatedBench
+        With its scene, true optics and wavelength.
+    instrument : InstrumentModel
+        The model declared in the file, all wavelengths; with a mosaic, every state is alike.
+    omega_deg : float
+        Angle of the arm.
+    exposure_s : float
+        Of every state, seconds.
+    states, darks : int
+    name : str
+        Of the sample.
 
     Raises
     ------
-    ValueError : the instrument turns other axes than psg and psa.
+    ValueError
+        The instrument turns other axes than psg and psa.
 
     Examples
     --------

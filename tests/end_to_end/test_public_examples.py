@@ -2,7 +2,9 @@
 
 import doctest
 import importlib
+import inspect
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -63,6 +65,20 @@ def made(tmp_path_factory, configs):
 def test_every_public_name_has_an_example(package):
     names = [name for name in package.__all__ if not isinstance(getattr(package, name), Path)]
     assert [name for name in names if ">>> " not in (getattr(package, name).__doc__ or "")] == []
+
+
+def test_every_public_function_describes_what_it_takes_and_returns():
+    wrong = []
+    for package in (processing, acquisition):
+        for name in filter(lambda name: inspect.isfunction(getattr(package, name)), package.__all__):
+            function = inspect.unwrap(getattr(package, name))
+            text, signature = inspect.getdoc(function), inspect.signature(function)
+            taken = re.search(r"Parameters\n-+\n(.*?)(?:\n\n|$)", text, re.DOTALL)
+            described = re.findall(r"^[\w, ]+", taken[1] if taken else "", re.MULTILINE)
+            words = {word.strip() for line in described for word in line.split(",")}
+            wrong += [f"{name}: {parameter}" for parameter in signature.parameters if parameter not in words]
+            wrong += [name] if signature.return_annotation != "None" and "Returns\n---" not in text else []
+    assert wrong == []
 
 
 @pytest.mark.parametrize("name", WITH_EXAMPLES)

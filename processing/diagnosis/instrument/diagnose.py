@@ -262,6 +262,8 @@ def diagnose_captures(
         Of one instrument, at one wavelength or several; what is known of each sample is in the file.
     model
         As loaded from its file.
+    say
+        Called with a line of text at each step.
 
     Returns
     -------

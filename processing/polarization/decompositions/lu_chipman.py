@@ -38,6 +38,15 @@ def lu_chipman(m: RealArray) -> LuChipman:
 
     Linear retarder, half wave plate and rotation come back as themselves, the ideal depolarizer as not defined.
 
+    Parameters
+    ----------
+    m : array (..., 4, 4)
+
+    Returns
+    -------
+    LuChipman
+        m = depolarizer retarder diattenuator, each (..., 4, 4).
+
     Examples
     --------
     >>> import numpy as np
