@@ -157,7 +157,7 @@ def positive(observed: Array) -> tuple[Array, Array]:
     --------
     >>> import numpy as np
     >>> [ends.round(1).tolist() for ends in positive(np.array([-1.0, 5.0]))]
-    [[[0.0, 4.0], [0.3, 6.0]], [[0.0, 3.0], [0.8, 7.0]]]
+    [[[0.0, 4.0], [0.3, 6.0]], [[0.0, 3.0], [1.1, 7.0]]]
     """
     out = []
     for (low, high), deviate in zip(_of_positive(), DEVIATES, strict=True):
