@@ -215,6 +215,7 @@ def test_a_wave_of_any_frequency_is_no_fault_of_the_plate(fault, seed, configs, 
     assert set(sure(diagnosed(tmp_path, configs, bench))) <= {"source_flicker"}
 
 
+@pytest.mark.long
 def test_a_name_beside_a_fault_without_one_is_likely(configs, tmp_path, bench):
     """An unknown mechanism has more parts than its sentence, and effects of the list describe them as well."""
     turn = 2 * np.pi / STATES
