@@ -17,7 +17,7 @@ from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.descent import LEAST_WIDTH
 from processing.diagnosis.search.fit import Fit, Solution, held_out, minimize, prior, score
 from processing.diagnosis.search.likely_set import everything
-from processing.diagnosis.search.posterior import Posterior, Say, first_look, posterior
+from processing.diagnosis.search.posterior import Posterior, Say, posterior
 from processing.diagnosis.search.rules import (
     EXACT,
     FAR_OFF,
@@ -31,9 +31,6 @@ from processing.diagnosis.search.space import Space
 from processing.instrument.elements import number
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import CaptureError
-
-#: [times] That the noise is taken from a first look at the counts before anything is weighed.
-FIRST_LOOKS = 4
 
 
 def predicts(problem: InstrumentProblem) -> InstrumentProblem:
@@ -102,10 +99,12 @@ class WholeBench:
         return Fit(values, self.whole.sums(space, values, derivatives=False), 0.0).rms > FAR_OFF
 
     def run(self) -> Posterior:
-        """The posterior with the noise that its light tells; again with what varies over the image."""
+        """The posterior; again with what varies over the image, and with the noise that the light found has."""
         plain = [c for c in self.pool if self._offered(c)]
         fixed = [*self.base.candidates, *self._clipped()]
-        self._take_noise_of_light([*fixed, *plain], fixed)
+        if self.whole.noise_known:
+            start = Space(tuple(fixed))
+            self.whole.level_noise(start, self._values_at_start(start))
         found = self._posterior([*fixed, *plain], fixed)
         if too_many := self.as_many_as_intensities(found, TAKES_PART):
             self.say(f"without {', '.join(c.label for c in too_many)}: it would be a value for each intensity")
@@ -117,22 +116,11 @@ class WholeBench:
             # What the noise seemed to speak against may be right beside what varies over the image.
             beside = self._with_fields(found, fixed, plain, fields)
             found = found if beside is found else self._with_what_scatters_so(beside, fixed)
+        # Behind a bent response the noise that counts should have is wrong by percents.
+        if self.whole.noise_known and self._adopt_noise(*applied(found, self.base)):
+            self.say("the same with the noise that this light has")
+            found = self._posterior(list(found.space.candidates), fixed, found)
         return found
-
-    def _take_noise_of_light(self, candidates: Sequence[Candidate], fixed: Sequence[Candidate]) -> None:
-        """Take the noise from the light that a first look tells, until it stays.
-
-        Behind a bent response the noise that counts should have is wrong by percents. Of many pixels that is more than
-        most causes explain, and some other bend, with others to undo it, would be found for it.
-        """
-        if not self.whole.noise_known:
-            return
-        space = Space(tuple(candidates))
-        start = self._values_at_start(space)
-        self.whole.level_noise(space, start)
-        for _ in range(FIRST_LOOKS):
-            if not self._adopt_noise(space, first_look(self.whole, space, fixed, start)):
-                break
 
     def _adopt_noise(self, space: Space, values: Array) -> bool:
         taken = self.whole.adopt_noise(space, values)
@@ -264,7 +252,6 @@ class WholeBench:
         if gains[best] < 2 * NEEDED:
             return found
         self.say(f"with {', '.join(c.label for c in fields)}")
-        self._take_noise_of_light([*fixed, *plain, *fields], fixed)
         return self._posterior([*fixed, *plain, *fields], fixed)
 
 

@@ -26,7 +26,6 @@ from processing.diagnosis.search.rules import (
     GROWTH,
     ROUNDS,
     SAMPLES,
-    SAMPLES_BEFORE,
     TAU,
 )
 from processing.diagnosis.search.sets import Group, Sets, State
@@ -137,12 +136,6 @@ def _looking(
     return look
 
 
-def first_look(problem: Problem, space: Space, fixed: Sequence[Candidate], start: Array) -> Array:
-    """Values (K,), mean over the sets that are likely where the problem is linearized about `start` (K,) alone."""
-    first = _looking(problem, space, grouped(space, fixed)[1], likely_set)(start)
-    return start if first is None else mean_over_sets(space, sample(first.sets, first.state, SAMPLES_BEFORE), start)
-
-
 def _total(problem: Problem, sums: Sums) -> float:
     return float(sums.excess.sum()) + (0.0 if problem.noise_known else float(sums.freedom.sum()))
 
@@ -160,14 +153,14 @@ def _found(
     look = _looking(problem, space, groups, likely_set)
     first = look(start)
     assert first is not None, "the instrument as declared has no intensities"
-    rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
+    begun: list[_Round | None] = [first]
     if first.state.unit > BENT or not problem.noise_known:
-        # Several large causes, none of which explains much alone, or far from linear: all of them at once first, as
-        # large as they may be.
-        first = look(all_at_once(problem, space, fixed, start, noise=first.sets.noise, tau=TAU[-1])) or first
-        problem.relinearize(space, first.about)
-        rounds -= 1
-    last = _settled(problem, space, first, look, rounds=rounds)
+        # Several large causes, none of which explains much alone, or far from linear: from all of them at once as well.
+        begun.append(look(all_at_once(problem, space, fixed, start, noise=first.sets.noise, tau=TAU[-1])))
+    rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
+    ended = [_settled(problem, space, one, look, rounds=rounds) for one in begun if one is not None]
+    last = max(ended, key=lambda one: one.score)
+    problem.relinearize(space, last.about)
     down = problem.noise_known and last.state.unit <= BENT
     # Structure is described by whatever comes nearest to it: what is found beside it is not compared so closely.
     last, others = _of_bends(problem, space, last, bends if down else (), look=look)
