@@ -19,7 +19,7 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.posterior import Say
-from processing.diagnosis.search.rules import FAR_OFF, MOSTLY
+from processing.diagnosis.search.rules import FAR_OFF
 from processing.diagnosis.search.space import Space
 from processing.instrument.elements import number
 
@@ -167,11 +167,9 @@ def first_values(problem: InstrumentProblem, base: Space, pool: Sequence[Candida
     fit = minimize(problem, base, np.zeros(base.size))
     several = base.size and len(set(problem.wavelengths_nm)) > 1
     # Curves over the wavelengths have more valleys than the values at one of them.
-    if fit.rms < (NEAR_ENOUGH if several else FAR_OFF):
+    if fit.rms < (NEAR_ENOUGH if several else FAR_OFF) or not any(c.effect.is_nominal for c in base.candidates):
         return base.split(fit.values)
     say("far off: searching from many starts")
-    if not any(c.effect.is_nominal for c in base.candidates):
-        return _far(problem, pool, base, fit)
     if not several:
         return _searched(problem, base, pool, fit)
     found = along_wavelengths(problem, base, say)
@@ -239,17 +237,6 @@ def _widths(space: Space, retardance: float) -> Array:
 def _anywhere(candidate: Candidate) -> bool:
     """A nominal value that may be far off: no window, no diattenuation."""
     return candidate.effect.is_nominal and candidate.parameters[0].typical >= NEAR_DEG
-
-
-def _far(problem: InstrumentProblem, pool: Sequence[Candidate], base: Space, fit: Fit) -> Values:
-    best, out = MOSTLY * fit.excess, base.split(fit.values)
-    for candidate in pool:
-        space = Space((*base.candidates, candidate))
-        for start in candidate.starts:
-            tried = minimize(problem, space, np.concatenate([fit.values, start]))
-            if tried.excess < best:
-                best, out = tried.excess, space.split(tried.values)
-    return out
 
 
 def along_wavelengths(problem: InstrumentProblem, base: Space, say: Say) -> Values:

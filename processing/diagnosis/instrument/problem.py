@@ -64,7 +64,6 @@ class InstrumentProblem:
     ) -> None:
         self.undone = dict(undone or {})
         self._others: list[InstrumentProblem] = []
-        self._noise_at: dict[Candidate, Array] = {}
         self.models = (models,) * len(captures) if isinstance(models, InstrumentModel) else tuple(models)
         self.model = self.models[0]
         self.wavelengths_nm = tuple(c.wavelength_nm for c in captures)
@@ -190,19 +189,9 @@ class InstrumentProblem:
         The evidence for an effect is always taken with one and the same noise; else a correction could gain by the
         noise that it pretends.
         """
-        if self.has_noise_of(space, values) or not self.level_noise(space, values):
-            return False
-        self._noise_at = exactly_undone(space, values, pointwise=True)
-        return True
-
-    def has_noise_of(self, space: Space, values: Array) -> bool:
-        """Whether the noise is that of the light that these values tell, or the same whatever the light."""
-        at = exactly_undone(space, values, pointwise=True)
-        gone = any(candidate not in at for candidate in self._noise_at)
-        if not gone and distance(self._noise_at, space, values, pointwise=True) < EXACT:
-            return True
-        stated = not any(c.slope.any() for c in self.captures)
-        return stated or any(c.noise_estimated for c in self.captures)
+        is_bent = distance({}, space, values, pointwise=True) >= EXACT
+        of_light = any(c.slope.any() for c in self.captures) and not any(c.noise_estimated for c in self.captures)
+        return is_bent and of_light and self.level_noise(space, values)
 
     def level_noise(self, space: Space, values: Array) -> bool:
         """Take the noise that light and differences of pixels tell beside these values, for all that follows.

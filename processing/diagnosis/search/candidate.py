@@ -24,15 +24,13 @@ from processing.instrument.nominal import FIELDS, KIND, shift_nominal
 class Candidate:
     """One effect at one place; in one capture or at one wavelength, if its values belong to that alone.
 
-    `starts` are values from which a fit starts, besides zero. With a `curve` the values are a smooth function of the
-    wavelength, and `parameters` its coefficients.
+    With a `curve` the values are a smooth function of the wavelength, and `parameters` its coefficients.
     """
 
     effect: Effect
     place: str
     parameters: tuple[Parameter, ...]
     capture: int | None = None
-    starts: tuple[Array, ...] = field(default=(), compare=False)
     wavelength_nm: float | None = None
     curve: Curve | None = None
     price: float = field(default=0.0, compare=False)
@@ -253,7 +251,7 @@ def pool(
                 if (effect.kind, place, number) not in found and fitted.isdisjoint(effect.shifts(model, place)):
                     parameters = effect.parameters(model, condition, place)
                     price = effect.log_price(model, condition, place)
-                    candidate = Candidate(effect, place, parameters, number, effect.starts(), price=price)
+                    candidate = Candidate(effect, place, parameters, number, price=price)
                     found[effect.kind, place, number] = _over_wavelengths(candidate, belongs, wavelengths_nm)
     return tuple(c for each in found.values() for c in each)
 
@@ -266,7 +264,7 @@ def _over_wavelengths(candidate: Candidate, belongs: Belongs, wavelengths_nm: Se
     smooth = curve(several, candidate.parameters) if belongs == "dispersion" else None
     if smooth is None:
         return [replace(candidate, wavelength_nm=w) for w in several]
-    return [replace(candidate, parameters=smooth.coefficients, curve=smooth, starts=())]
+    return [replace(candidate, parameters=smooth.coefficients, curve=smooth)]
 
 
 def _check_declared(model: InstrumentModel) -> None:

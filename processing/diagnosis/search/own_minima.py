@@ -132,12 +132,6 @@ class OwnMinima:
             # What is left is less than there was, and counts for more.
             least = ENOUGH * self._unit(fit)
             fit = minimize(self.problem, space, fit.values, least_gain=least)
-        for candidate, part in space.pairs:
-            for far in candidate.starts:
-                start = fit.values.copy()
-                start[part] = far
-                tried = minimize(self.problem, space, start, least_gain=least)
-                fit = tried if tried.excess < fit.excess - least else fit
         return fit
 
     def _climbed(self, here: Visited) -> Visited:

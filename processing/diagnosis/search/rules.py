@@ -70,7 +70,7 @@ SMALL = 0.05
 GAIN_OFF = 0.03
 
 # ---- search --------------------------------------------------------------------------------------------------------
-#: [of the signal] Residual above which nominal values, and what else has far starts, are searched for from many starts.
+#: [of the signal] Residual above which nominal values are searched for from many starts.
 FAR_OFF = 0.05
 #: [unit of chi-square] After the first choice of groups, from which on the first linearization is not believed.
 BENT = 2.0

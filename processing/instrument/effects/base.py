@@ -36,10 +36,6 @@ class InstrumentEffect(Effect, ABC):
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         """Add the effect of `values`, one for each parameter, to the changes."""
 
-    def starts(self) -> tuple[Array, ...]:
-        """Values far from zero from which a fit starts as well."""
-        return ()
-
     def log_price(self, model: InstrumentModel, conditions: Conditions, place: str) -> float:
         """Log odds by which it is rarer at this place than an effect of the list."""
         return 0.0

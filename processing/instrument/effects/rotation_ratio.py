@@ -9,16 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects.base import InstrumentEffect, moving_axes, turned_by
 from processing.instrument.model import InstrumentModel
-
-#: relative = -2 turns the other way by as much as was asked.
-REVERSED = -2.0
 
 
 class RotationRatio(InstrumentEffect):
@@ -34,6 +29,3 @@ class RotationRatio(InstrumentEffect):
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.turn_axis(place, values[0] * changes.conditions.angles_deg[place], turned_by(model, place))
-
-    def starts(self) -> tuple[Array, ...]:
-        return (np.array([REVERSED]),)
