@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from processing.arrays import Array
 from processing.diagnosis.instrument.doubts import PARTS
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES, features
-from processing.diagnosis.instrument.mueller_error import MuellerErrors, UncertainMueller
+from processing.diagnosis.instrument.mueller_error import MuellerErrors
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import Residual
 from processing.diagnosis.search.candidate import Candidate
@@ -27,7 +27,6 @@ from processing.diagnosis.search.result import (
     Correction,
     Error,
     FoundEffect,
-    MuellerError,
     NoiseReport,
     NotMeasured,
     Ranked,
@@ -278,20 +277,15 @@ def correction(
     # Values that are merely nominal are nowhere near what is true.
     nominal = any(c.place for c in solved.base.candidates)
     known = judgement.refused is None or not nominal or (judgement.first is None and solved.before.rms < FAR_OFF)
-    uncertain = errors.uncertain(problem, used) if known else None
+    stored, told = (errors.uncertain(problem, used) if known else None) or (None, None)
     return Correction(
         effects=tuple(effects),
-        systematic=None if uncertain is None else uncertain.error,
-        mueller=None if uncertain is None else _mueller_error(uncertain),
+        systematic=stored,
+        mueller=told,
         combinations=combinations(found, solved) if any_cause else (),
         checks=judgement.checks,
         refused=judgement.refused,
     )
-
-
-def _mueller_error(uncertain: UncertainMueller) -> MuellerError:
-    elements = tuple(float(x) for x in uncertain.of_elements.ravel())
-    return MuellerError(elements=elements, rms=uncertain.error.rms_over_m00, most=uncertain.most.short)
 
 
 def _wavelength(problem: InstrumentProblem, candidate: Candidate) -> float | None:

@@ -22,7 +22,7 @@ def checks(problem: InstrumentProblem, solved: Solution) -> tuple[Check, ...]:
     for k, data in enumerate(problem.captures):
         if several:
             # The sum decides; what became of each is told also where nothing is written.
-            old, new = (100 * found.rms_of(k) for found in (solved.before, solved.after))
+            old, new = (100 * found.of(k).rms for found in (solved.before, solved.after))
             name = f"rms on held-out data of {data.name} at {data.wavelength_nm:g} nm, percent"
             out.append(Check(name=name, before=old, after=new, holds=True))
         out += rows_checks(

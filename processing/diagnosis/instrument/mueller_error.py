@@ -20,6 +20,7 @@ from processing.diagnosis.search.decision import PredictedChange, predicted_chan
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.range_of import RANK
+from processing.diagnosis.search.result import MuellerError
 from processing.diagnosis.search.rules import TAKES_PART
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
@@ -102,22 +103,6 @@ def _all_columns(problem: InstrumentProblem, k: int, changes: Changes) -> Array:
     return np.asarray(w / problem.moments[k].sigma[:, None])
 
 
-@dataclass(frozen=True)
-class UncertainMueller:
-    """What stays uncertain of M/m00.
-
-    Attributes
-    ----------
-    error : as an instrument file stores it.
-    of_elements : (4, 4) standard errors of the elements of M/m00, rms over the pixels of these captures.
-    most : the candidate that the largest of them owes most to.
-    """
-
-    error: SystematicError
-    of_elements: Array
-    most: Candidate
-
-
 @dataclass(frozen=True, eq=False)
 class MuellerErrors:
     """Errors of M/m00 that the posterior expects, by one covariance for guard, error bar and report.
@@ -170,8 +155,11 @@ class MuellerErrors:
     def _of(self, scope: str) -> NDArray[np.bool_]:
         return np.array([scope_of(c) == scope for c in self.space.candidates for _ in c.parameters], dtype=bool)
 
-    def uncertain(self, problem: InstrumentProblem, used: Solution) -> UncertainMueller | None:
-        """What stays uncertain of M/m00 about the values that are applied; None where nothing does."""
+    def uncertain(self, problem: InstrumentProblem, used: Solution) -> tuple[SystematicError, MuellerError] | None:
+        """What stays uncertain of M/m00 about the values that are applied, as a file stores it and as it is told.
+
+        None where nothing does.
+        """
         missed = self.values - self.given(used)
         covariance = self.covariance + np.outer(missed, missed)
         of_elements = np.sum(covariance * self.products, axis=(1, 2)) * ELEMENTS
@@ -186,25 +174,24 @@ class MuellerErrors:
         names = tuple(c.name for c in problem.captures)
         several = len(set(problem.wavelengths_nm)) > 1
         slopes = np.sqrt(np.maximum(np.diag(products), 0.0))
-        error = SystematicError(
+        rms = float(np.sqrt(of_elements.sum() / ELEMENTS))
+        stored = SystematicError(
             directions=tuple(
                 _as_effects(self.space, d, slopes * np.abs(d), names) for d in directions.T[: min(enough, MOST_STORED)]
             ),
-            rms_over_m00=float(np.sqrt(of_elements.sum() / ELEMENTS)),
+            rms_over_m00=rms,
             wavelength_nm=None if several else problem.wavelengths_nm[0],
         )
         alone = [float(np.sum((covariance * largest)[p, p])) for p in self.space.slices]
-        return UncertainMueller(
-            error,
-            np.sqrt(np.maximum(of_elements, 0.0)).reshape(4, 4),
-            self.space.candidates[int(np.argmax(alone))],
-        )
+        most = self.space.candidates[int(np.argmax(alone))].short
+        elements = tuple(map(float, np.sqrt(np.maximum(of_elements, 0.0))))
+        return stored, MuellerError(elements=elements, rms=rms, most=most)
 
 
 def _left(problem: InstrumentProblem, solved: Solution) -> Array:
     """What is left over of each capture (captures,) after the correction, in units of its noise; noise at least."""
     noise = np.array([m.noise_floor for m in problem.moments])
-    left = np.array([solved.after.rms_of(k) for k in range(noise.size)])
+    left = np.array([solved.after.of(k).rms for k in range(noise.size)])
     return np.asarray(np.maximum(left / np.maximum(noise, 1e-300), 1.0))
 
 

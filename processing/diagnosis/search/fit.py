@@ -166,10 +166,6 @@ class HeldOut:
     count: float
     shares: Array = field(default_factory=lambda: np.zeros((0, 4)))
 
-    def rms_of(self, capture: int) -> float:
-        """`rms` of one capture alone."""
-        return self.of(capture).rms
-
     def of(self, capture: int) -> HeldOut:
         """The same of one capture alone."""
         square, count, excess, freedom = self.shares[capture].tolist()
