@@ -22,7 +22,7 @@ FOLDS = 5
 #: Residual of all Mueller elements over m00 in percent, before and after: found on these data, held-out directions.
 FOUND = {0.351: (1.87, 1.60), 0.532: (2.02, 1.38), 0.633: (2.24, 1.53), 1.064: (2.84, 2.08)}
 #: The same with the refractive index (and k) fitted in place of an effect, n down to 1.01.
-INDEX = {0.351: 1.57, 0.532: 1.48, 0.633: 1.67, 1.064: 2.29}
+INDEX = {0.351: 1.57, 0.532: 1.47, 0.633: 1.67, 1.064: 2.29}
 
 
 class ReflectanceProblem:
