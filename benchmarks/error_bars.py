@@ -114,7 +114,7 @@ def cells(
                 inside_68 = (np.abs(off) <= error + tolerance)[exists]
                 if f"{name}_68" in found:
                     bounds = found[f"{name}_68"][..., mine]
-                    inside_68 = ((bounds[0] <= true) & (true <= bounds[1]))[exists]
+                    inside_68 = ((bounds[0] <= true + tolerance) & (true - tolerance <= bounds[1]))[exists]
             # Where there is no value the interval is everything.
             unknown = (~np.isfinite(value) & (low <= true + tolerance) & (true - tolerance <= high))[exists]
             inside_68, inside_95 = inside_68 | unknown, inside_95 | unknown

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
 from processing.polarization.eigenvalue_noise import TRIPLE, EigenvalueNoise
+from processing.polarization.magnitude import NORMAL_95
 from processing.polarization.quantities import deviation_from_td
 from processing.polarization.triply_degenerate import mueller_matrix
 from processing.storage.products.images import MuellerImage
+
+#: A longer or shorter one is not of second order.
+MOST = 2.0
 
 
 def coherency_noise(image: MuellerImage) -> EigenvalueNoise:
@@ -17,7 +23,7 @@ def coherency_noise(image: MuellerImage) -> EigenvalueNoise:
 
     To first order d xi0 = <dM, m0 - 4 xi0 e00> / (4 m00), m0 being the dominant process.
     """
-    m0 = xi0_and_dominant(image.matrices)[1]
+    xi0, m0 = xi0_and_dominant(image.matrices)
     process = np.asarray(m0, dtype=np.float32).reshape(*m0.shape[:2], 16)
     m00 = image.values[0, 0].astype(float)
     alone = process.copy()
@@ -29,9 +35,28 @@ def coherency_noise(image: MuellerImage) -> EigenvalueNoise:
         total = np.square(image.errors).sum(axis=(0, 1)) / (4 * m00**2)
         with_m00 = (whole - known_m00 - brightness) / (8 * m00**2)
         along = np.sqrt(known_m00) / (4 * m00)
-        return EigenvalueNoise.of(
+        found = EigenvalueNoise.of(
             total, row, whole / (4 * m00) ** 2, along, m00=np.sqrt(brightness) / np.abs(m00), with_m00=with_m00
         )
+        below, above = _stretches(image, xi0, process)
+    return replace(found, below=below, above=above)
+
+
+def _stretches(
+    image: MuellerImage, xi0: NDArray[np.floating], process: NDArray[np.float32]
+) -> list[NDArray[np.float64]]:
+    """How far xi0 falls and rises within the ellipsoid of 1.96 errors, over 1.96 of its errors to first order.
+
+    Noise that makes xi0 larger also turns the dominant process, to where the noise is another one.
+    """
+    slope = process.copy()
+    slope[..., 0] -= 4 * xi0
+    moved = image.covariance_with(slope)
+    error = np.sqrt(np.einsum("xyi,xyi->xy", moved, slope))
+    step = (NORMAL_95 * moved / error[..., None]).reshape(*xi0.shape, 4, 4)
+    matrices, reach = image.matrices.astype(float), NORMAL_95 * error / (4 * np.abs(image.values[0, 0]))
+    ends = [np.abs(xi0_and_dominant(matrices + side * step)[0] - xi0) / reach for side in (-1, 1)]
+    return [np.where(np.isfinite(end), np.clip(end, 1 / MOST, MOST), 1.0) for end in ends]
 
 
 def largest_deviation_by_noise(image: MuellerImage) -> NDArray[np.float64]:

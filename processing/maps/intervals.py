@@ -29,13 +29,13 @@ Planes = dict[str, NDArray[Any]]
 
 #: Probabilities that fast and slow axis have changed places from which on the 68 and 95 % interval holds both.
 FLIPPED = (0.2, 0.02)
-#: Equal eigenvalues mix by all of the noise between them, and less and less up to this many times it.
-APART = 5.0
 #: Equal eigenvalues are seen apart by the noise between them times the root of this, on average.
 _REPELLED = 4.0
 #: Parts of the light not in the dominant process between which entropy passes from that of a nearly pure sample to that
 #: of a depolarizer, and errors of the depolarization index from which on its own bend is seen.
 PURE, FLAT = (0.15, 0.45), 5.0
+#: Largest singular value of 3 x 3 noise of variance 1: 68 % of them are smaller.
+OF_NOISE = 2.8
 #: A rotation is determined where the weakest factor that it is divided by is this many times its noise.
 SEEN = 3.0
 EITHER_AXIS = "retardance_axis_or_90_deg"
@@ -154,7 +154,7 @@ def set_ratios(planes: Planes, derived: Mapping[str, Derived], image: ElementNoi
 
     With q = a/b to first order in all elements but b = m00, a - q0 b is normal for every q0, and its variance is that
     of q, less twice the covariance of q and b times what q0 is off, plus the variance of b times that squared, over
-    b^2. Where m00 may be zero nothing is known.
+    b^2. Where m00 may be zero nothing is known, and where a quantity does not exist it may be anything.
 
     Parameters
     ----------
@@ -162,7 +162,8 @@ def set_ratios(planes: Planes, derived: Mapping[str, Derived], image: ElementNoi
     """
     of_m00 = image.covariance()[..., 0].astype(float)
     relative = np.where(m00 > 0, np.sqrt(of_m00[..., 0]) / m00, np.inf)
-    some = relative > UNEVEN
+    measured = np.isfinite(of_m00[..., 0])
+    some = measured & (relative > UNEVEN)
     u, of_m00 = relative[some], of_m00[some] / m00[some][:, None]
     for name, quantity in derived.items():
         if name not in planes:
@@ -170,6 +171,12 @@ def set_ratios(planes: Planes, derived: Mapping[str, Derived], image: ElementNoi
         value, error = planes[name], planes[f"{name}_errors"]
         if f"{name}_95" not in planes and has_own_95(name):
             planes[f"{name}_95"] = np.stack([value - NORMAL_95 * error, value + NORMAL_95 * error])
+        lost = measured & ~np.isfinite(value)
+        if lost.any():
+            low, high = _range(name, value)
+            np.copyto(error, high - low, where=lost)
+            if has_own_95(name):
+                np.copyto(planes[f"{name}_95"], np.stack([low, high]), where=lost)
         if not some.any():
             continue
         own = value[..., some].astype(float)
@@ -178,20 +185,23 @@ def set_ratios(planes: Planes, derived: Mapping[str, Derived], image: ElementNoi
             # No ratio to m00.
             bent, shared = np.zeros_like(u), np.zeros_like(shared)
         low, high = _range(name, own)
-        half = np.max(np.abs(_over(np.stack([-error[..., some], error[..., some]]), bent, shared, 1.0)), axis=0)
+        half = np.max(np.abs(over_m00(np.stack([-error[..., some], error[..., some]]), bent, shared, 1.0)), axis=0)
         everything = np.where(np.isfinite(own), np.maximum(own - low, high - own), high - low)
         error[..., some] = np.where(u < 1 / SEEN, half, everything)
         if has_own_95(name):
             bounds = planes[f"{name}_95"]
             ends = bounds[..., some]
-            wide = own + _over(ends - own, bent, shared, NORMAL_95)
+            wide = own + over_m00(ends - own, bent, shared, NORMAL_95)
             # The end of a range stays.
             kept = (ends == 0) | (ends == low) | (ends == high) | ~np.isfinite(ends) | ~np.isfinite(own)
             bounds[..., some] = np.where(u < 1 / SEEN, np.where(kept, ends, wide), np.stack([low, high]))
 
 
-def _over(sides: Array, u: Array, shared: Array, deviate: float) -> Array:
-    """Ends (2, ...) of an interval from its middle, of a ratio to m00 with the relative error u."""
+def over_m00(sides: Array, u: Array, shared: Array, deviate: float) -> Array:
+    """Ends (2, ...) of an interval from its middle, of a ratio to m00 with the relative error u; see `set_ratios`.
+
+    `shared` is the covariance of the two.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         known = 1 - np.square(deviate * u)
         # Beyond where first order holds the gradient may be anything, but no covariance is larger than both errors.
@@ -359,37 +369,35 @@ def set_differential(planes: Planes, is_determined: NDArray[np.bool_]) -> None:
         _put(planes, name, value, half, *ends)
 
 
-def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0) -> Array:
+def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0, components: float) -> Array:
     """Noise taken off eigenvalues, which it pushes apart, and off what follows from them.
 
     xi0 is that of `process xi0`. The others keep their mean; their gaps say how far noise has pushed them. Returns the
     eigenvalues (4, ...) whose deviations from that mean have lost what noise adds to their sum of squares.
+
+    Parameters
+    ----------
+    components : directions that their noise has, see `sorted_eigenvalues.block_components`.
     """
-    xi, errors = planes["coherency_eigenvalues"].astype(float), planes["coherency_eigenvalues_errors"].astype(float)
+    xi = planes["coherency_eigenvalues"].astype(float)
     deviation = planes["eigenvalue_deviation"].astype(float)
     observed = np.sum(deviation**2, axis=0)
     real = np.sqrt(np.maximum(1 - noise.others / observed, 0))
     unit = np.sqrt(noise.others / 8)
-    gaps = -np.diff(xi[1:], axis=0)
-    three = of_gaps(*(gaps / unit))
-    # Where an eigenvalue is apart from the others it has the noise of its own process, else of all three.
-    apart = np.clip(np.stack([gaps[0], gaps.min(axis=0), gaps[1]]) / (APART * unit), 0, 1)
-    mixed, mean = unit * (1 - apart), (1 - found.xi0) / 3
+    own = planes["eigenvalue_deviation_errors"] / (np.sqrt(2 / 3) * unit)
+    first, second = -np.diff(xi[1:], axis=0) / unit
+    three = of_gaps(first, second, own, components)
+    mean = (1 - found.xi0) / 3
     shrunk = np.stack([found.xi0, *(mean + real * deviation)])
-    # The table is of even noise; noise that differs between the processes scales its intervals. No theory gives these
-    # factors: docs/error-bars.md has what they cover.
-    own = errors[1:] / (np.sqrt(0.75) * unit)
-    common = np.maximum(np.sqrt(np.mean(own**2, axis=0)), 1)
-    scale_68, scale_95 = unit * (common + apart * (own - common)), unit * np.maximum(own, common)
     with_mean, without_mean = three.with_mean(found.stderr / (3 * unit)), three.with_mean(np.zeros_like(unit))
     deviation = deviation + unit * three.middle
     xi = mean + deviation
-    low, high = xi - scale_95 * with_mean.below, xi + scale_95 * with_mean.above
+    low, high = xi - unit * with_mean.below, xi + unit * with_mean.above
     _put(
         planes,
         "coherency_eigenvalues",
         np.stack([found.xi0, *xi]),
-        np.stack([found.stderr, *(scale_68 * with_mean.half)]),
+        np.stack([found.stderr, *(unit * with_mean.half)]),
         np.stack([found.interval_95[0], *low]),
         np.stack([found.interval_95[1], *high]),
     )
@@ -397,14 +405,16 @@ def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0)
         planes,
         "eigenvalue_deviation",
         deviation,
-        scale_68 * without_mean.half,
-        deviation - scale_95 * without_mean.below,
-        deviation + scale_95 * without_mean.above,
+        unit * without_mean.half,
+        deviation - unit * without_mean.below,
+        deviation + unit * without_mean.above,
     )
     missed = planes["td_missed"].astype(float)
     planes["td_missed_noise"] = (missed * np.sqrt(noise.others / observed)).astype(np.float32)
-    planes["td_missed"] = (missed * real).astype(np.float32)
-    planes["td_missed_errors"] = np.hypot(planes["td_missed_errors"], mixed.max(axis=0)).astype(np.float32)
+    # Nearly in proportion to the root of their sum of squares, the length of a vector.
+    total = np.square(missed) / observed * noise.others
+    along = np.square(planes["td_missed_errors"].astype(float))
+    _put(planes, "td_missed", *interval(missed, along, total, total**2 / components))
     return shrunk
 
 
@@ -425,17 +435,38 @@ def set_entropy(planes: Planes, xi: Array, found: CorrectedXi0) -> None:
     scale = np.sqrt(4 / 3 * np.square(off).sum(axis=0))
     share = np.clip((1 - found.xi0 - PURE[0]) / (PURE[1] - PURE[0]), 0, 1)
     both = (found.interval_68, np.stack([index - u, index + u])), (found.interval_95, planes["depolarization_index_95"])
+    middle, half = planes["td_missed"].astype(float), planes["td_missed_errors"].astype(float)
+    missed = np.stack([np.maximum(middle - half, 0), middle + half]), planes["td_missed_95"]
     ends = []
     for (of_xi0, of_index), deviate, level in zip(both, (1.0, NORMAL_95), (0, 1), strict=True):
         unit = (of_xi0[1] - of_xi0[0]) / (2 * deviate)
         observed = (1 - found.xi0) / unit
         lost = np.where(observed < 4, positive(observed)[level] * unit, 1 - of_xi0[::-1])
-        pure = [entropy_of(np.concatenate([1 - p[None], p * rest])) for p in np.clip(lost, 0, 0.75)]
+        pure = _of_pure(lost, 1 - found.xi0, rest, missed[level] / np.where(middle > 0, middle, 1))
         even = [entropy_of(0.25 + off * (np.maximum(x, 0) / scale)) for x in of_index[::-1]]
-        known = own - deviate * spread, own + deviate * spread
-        ends += [np.where(bent, (1 - share) * p + share * e, k) for p, e, k in zip(pure, even, known, strict=True)]
+        far = [(1 - share) * p + share * e for p, e in zip(pure, even, strict=True)]
+        near = [own - deviate * spread, own + deviate * spread]
+        if level:
+            # Beyond first order entropy depends on both.
+            near = [np.fmin(near[0], far[0]), np.fmax(near[1], far[1])]
+        ends += [np.where(bent, f, n) for f, n in zip(far, near, strict=True)]
     low, high, low_95, high_95 = ends
     _put(planes, "entropy", (low + high) / 2, (high - low) / 2, np.maximum(low_95, 0), np.minimum(high_95, 1))
+
+
+def _of_pure(lost: Array, middle: Array, rest: Array, apart: Array) -> list[Array]:
+    """Ends of the entropy by those (2, ...) of what xi0 leaves, and of how far the others `rest` (3, ...) are apart."""
+
+    def at(p: Array, spread: Array | float) -> Array:
+        light = np.clip(p, 0, 0.75)
+        shares = np.clip(1 / 3 + spread * (rest - 1 / 3), 0, None)
+        return entropy_of(np.concatenate([1 - light[None], light * shares / shares.sum(axis=0)]))
+
+    own = at(middle, 1.0)
+    return [
+        own + side * np.hypot(at(p, 1.0) - own, at(middle, spread) - own)
+        for p, spread, side in zip(lost, apart[::-1], (-1, 1), strict=True)
+    ]
 
 
 def entropy_of(xi: Array) -> Array:
@@ -457,23 +488,27 @@ def set_symmetric(planes: Planes, relative: Array) -> None:
     near = ~(np.abs(np.diff(value, axis=0)) > SEEN * np.hypot(error[:-1], error[1:]))
     for k, name in enumerate(names):
         mixed = near[k] | near[min(k + 1, 2)] | (np.abs(value[k + 1]) < SEEN * relative)
-        spread = np.hypot(error[k + 1], np.where(mixed, 2 * relative, 0))
+        spread = np.hypot(error[k + 1], np.where(mixed, (OF_NOISE if k == 0 else 2) * relative, 0))
         known = np.isfinite(spread)
         bounds = value[k + 1] - NORMAL_95 * spread, value[k + 1] + NORMAL_95 * spread
         low, high = (np.where(known, b, end) for b, end in zip(bounds, (-1.0, 1.0), strict=True))
         _put(planes, name, value[k + 1], spread, low, high)
 
 
-def widen_dominant(planes: Planes, noise: EigenvalueNoise) -> Array:
+def widen_dominant(planes: Planes, noise: EigenvalueNoise, uneven: float) -> Array:
     """Errors of the dominant process for the gap without noise, which pushes eigenvalues apart.
 
     `set_eigenvalues` is done. Returns the factor (...), NaN where the process is not determined.
+
+    Parameters
+    ----------
+    uneven : noise of the noisiest directions over that of all.
     """
     xi = planes["coherency_eigenvalues"].astype(float)
-    gap = xi[0] - xi[1]
+    gap, coupling = xi[0] - xi[1], uneven * noise.coupling
     # Two processes whose eigenvalues were equal would be seen this far apart.
-    seen = (gap + np.sqrt(gap**2 + 4 * _REPELLED * noise.coupling**2)) / 2
-    factor = np.where(gap > SEEN * noise.coupling, seen / gap, np.nan)
+    seen = (gap + np.sqrt(gap**2 + 4 * _REPELLED * coupling**2)) / 2
+    factor = np.where(gap > SEEN * coupling, seen / gap, np.nan)
     for name in [n for n in planes if n.startswith("dominant_") and not n.endswith("_errors")]:
         planes[f"{name}_errors"] = planes[f"{name}_errors"] * factor.astype(np.float32)
     return factor

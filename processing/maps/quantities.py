@@ -41,6 +41,7 @@ from processing.polarization.eigenvalue_noise import corrected
 from processing.polarization.propagation import Derived
 from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.scalar_files import scalar_quantities
+from processing.polarization.sorted_eigenvalues import block_components
 from processing.polarization.vector_noise import of_slopes
 from processing.reduction.mueller import Progress
 from processing.reduction.systematic import INPUTS, Systematic
@@ -253,15 +254,19 @@ def _set_intervals(
     error, linear_error = found["retardance_deg_errors"], found["retardance_linear_deg_errors"]
     diattenuation_error = found["diattenuation_errors"]
     factor: NDArray[np.float64] | float = 1.0
+    uneven = 1.0
     found["td_missed_noise"] = np.zeros_like(found["td_missed"])
     found["valid"] = np.isfinite(found["td_missed"]).astype(np.uint8)
     if isinstance(image, MuellerImage):
         noise = coherency_noise(image)
         found["valid"] &= is_valid(image, noise)
         xi = np.moveaxis(found["coherency_eigenvalues"], 0, -1).astype(float)
-        xi0 = corrected(xi, noise, image.covariance_of_depolarizer())
-        shrunk = set_eigenvalues(found, noise, xi0)
-        factor = widen_dominant(found, noise)
+        of_depolarizer = image.covariance_of_depolarizer()
+        xi0 = corrected(xi, noise, of_depolarizer)
+        components = block_components(of_depolarizer)
+        uneven = np.sqrt(8 / components)
+        shrunk = set_eigenvalues(found, noise, xi0, components)
+        factor = widen_dominant(found, noise, uneven)
     set_magnitudes(found, derived, m, image, widened=factor)
     if isinstance(image, MuellerImage):
         set_any_dominant(found, derived, np.isfinite(factor))
@@ -269,13 +274,14 @@ def _set_intervals(
     weakest = np.abs(_symmetric_eigenvalues(np.nan_to_num(depolarizer[..., 1:, 1:]))).min(axis=0)
     # What is left of the light after the diattenuator carries the noise of all of it.
     passed = 1 - np.square(np.asarray(derived["diattenuation"].value) + diattenuation_error)
-    is_determined = (passed > 0) & (weakest * passed > SEEN * _relative_error(image))
+    least = SEEN * uneven * _relative_error(image)
+    is_determined = (passed > 0) & (weakest * passed > least)
     set_retardance(found, derived, error, linear_error, is_determined=is_determined)
-    set_depolarization_power(found, passed > SEEN * _relative_error(image))
+    set_depolarization_power(found, passed > least)
     if "differential_retardance_deg" in found:
         set_differential(found, is_determined & _is_principal(found))
     if "symmetric_d1" in found:
-        set_symmetric(found, _relative_error(image))
+        set_symmetric(found, uneven * _relative_error(image))
     set_ratios(found, derived, image, m[..., 0, 0])
 
 

@@ -14,7 +14,7 @@ from scipy import ndimage
 from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
 from processing.maps.coherency_noise import coherency_noise
-from processing.maps.intervals import moves_of, widened
+from processing.maps.intervals import SEEN, UNEVEN, moves_of, over_m00, widened
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
 from processing.polarization.eigenvalue_noise import EigenvalueNoise, corrected
 from processing.polarization.xi0 import Xi0Estimate, estimate
@@ -110,6 +110,14 @@ def eigenvalue_block(image: MuellerImage) -> dict[str, NDArray[Any]]:
     eigenvalues = coherency_eigenvalues(image.matrices)
     noise = coherency_noise(image)
     found = corrected(eigenvalues.astype(float), noise, image.covariance_of_depolarizer())
+    intervals = {}
+    # What a noisy m00 does to the ratio beyond first order.
+    shared = noise.with_m00 - (found.xi0 - 0.25) * noise.m00**2
+    for name, ends, deviate in (("xi0_68", found.interval_68, 1.0), ("xi0_95", found.interval_95, NORMAL_95)):
+        wide = found.xi0 + over_m00(ends - found.xi0, noise.m00, shared, deviate)
+        wide = np.where(noise.m00 > UNEVEN, wide, ends)
+        unknown = (noise.m00 > 1 / SEEN) | (image.values[0, 0] <= 0)
+        intervals[name] = np.where(unknown, np.array([0.25, 1.0])[:, None, None], wide)
     known = np.isfinite(found.xi0)
     # Without standard errors nothing can be taken off.
     xi0 = np.where(known, found.xi0, eigenvalues[..., 0])
@@ -117,8 +125,7 @@ def eigenvalue_block(image: MuellerImage) -> dict[str, NDArray[Any]]:
     return {
         "xi0": xi0,
         "xi0_errors": found.stderr,
-        "xi0_68": found.interval_68,
-        "xi0_95": found.interval_95,
+        **intervals,
         "xi0_shift": found.shift,
         "eigenvalues": np.moveaxis(eigenvalues, -1, 0),
         "eigenvalue_spread": found.spread,

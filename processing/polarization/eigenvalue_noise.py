@@ -48,6 +48,7 @@ class EigenvalueNoise:
     coupling : root mean square of the elements of H between the dominant process and another.
     others : sum of squares that noise alone puts into the deviations of xi1, xi2, xi3 from their mean.
     overall : root mean square of an element of H over all directions; `coupling`, where they are alike.
+    below, above : reach of xi0 within the ellipsoid of 1.96 errors over 1.96 errors to first order.
     """
 
     along: Array
@@ -56,6 +57,8 @@ class EigenvalueNoise:
     coupling: Array
     others: Array
     overall: Array
+    below: Array | float = 1.0
+    above: Array | float = 1.0
 
     @classmethod
     def of(
@@ -72,8 +75,10 @@ class EigenvalueNoise:
         """
         with np.errstate(invalid="ignore"):
             coupling = np.sqrt(np.maximum(row - diagonal, 0) / 3)
-            # In the 3 x 3 block of the others 9 numbers are noise; 1 is their mean.
-            others = np.maximum(total - 2 * row + diagonal, 0) * (8 / 9)
+            # Of the 3 x 3 block of the others, less their mean: its trace is what m00 and v leave.
+            trace = m00**2 / 2 + diagonal - 2 * with_m00
+            block = total - 2 * row + diagonal
+            others = np.maximum(block - trace / 3, _LEAST * block)
             overall = np.sqrt(total / 16)
         return cls(along, m00, with_m00, coupling, others, overall)
 
@@ -142,9 +147,16 @@ def _heights(height: Array, noise: EigenvalueNoise, covariance: NDArray[np.float
     # What m00 adds is in proportion to the true height.
     near = middle + (near - middle) * (noise.error_at(np.maximum(middle, 0) * unit) / noise.along)
     error = 4 / 3 * noise.error_at(height) / unit
+    known_process = np.clip((middle - _NEAR) / (_FAR - _NEAR), 0, 1)
+    sure_process = np.clip(middle / _FAR - 1, 0, 1)
     repelled = 4 * _SHIFT * (noise.coupling / unit) ** 2
     for bound, deviate in zip(near, _DEVIATES, strict=True):
-        far = observed - error * deviate
+        # The upper bound is the height of which the observation is a low quantile.
+        more = abs(deviate) / _DEVIATES[-1] * ((noise.above if deviate < 0 else noise.below) - 1)
+        # Near 1/4 the process that is seen is that of the noise; the table knows its width alone.
+        stretch = 1 + np.where(more > 0, known_process, sure_process) * more
+        bound += (stretch - 1) * (bound - middle)
+        far = observed - error * deviate * stretch
         beyond = (far + np.sqrt(np.maximum(far**2 - repelled, 0))) / 2
         share = np.clip((beyond - _NEAR) / (_FAR - _NEAR), 0, 1)
         bound += share * (beyond - bound)

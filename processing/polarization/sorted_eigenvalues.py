@@ -20,6 +20,10 @@ from processing.polarization.vector_kernels import interpolate
 
 #: Nodes of the table along both gaps, in units of the noise of an element.
 GAPS = np.array([0, 1, 2, 3, 4, 5, 6.5, 8.5, 11, 14.0])
+#: Nodes along the number of directions that the noise has: (tr C)^2 / tr C^2, C being the covariance of the block.
+COMPONENTS = (1.3, 1.6, 2.2, 3.5, 5.5, 8.0)
+#: Errors to first order, of the eigenvectors that are seen, are at least this part of what they are with equal noise.
+LEAST_OWN = 0.3
 #: Variance of the mean of the three in that unit squared: of an isotropic 4 x 4 matrix of fixed trace.
 OF_MEAN = 1 / 12
 TABLE = Path(__file__).with_name("eigenvalue_table.npz")
@@ -52,35 +56,61 @@ class Sorted(NamedTuple):
         return Sorted(self.middle, wide(self.half, 1.0), *ends)
 
 
-def of_gaps(first: Array, second: Array) -> Sorted:
-    """Intervals for the observed gaps (...) of the largest and of the smallest eigenvalue to the middle one.
+def block_components(covariance: NDArray[np.float64]) -> float:
+    """Directions that the noise of a block of three eigenvalues has, on average over blocks.
+
+    Parameters
+    ----------
+    covariance : (16, 16), of the elements of an ideal depolarizer, in any unit.
 
     Examples
     --------
     >>> import numpy as np
-    >>> found = of_gaps(np.array([1.0, 20.0]), np.array([1.0, 20.0]))
+    >>> round(block_components(np.eye(16)), 6)
+    8.0
+    """
+    elements = covariance[1:, 1:]
+    whole = np.sum(elements**2) / np.trace(elements) ** 2
+    # Exact for one direction, which is all that a block sees of it, and for 15 alike.
+    return float(1 / (1 / 8 + 15 / 16 * (whole - 1 / 15)))
+
+
+def of_gaps(first: Array, second: Array, own: Array, components: float) -> Sorted:
+    """Intervals for the observed gaps (...) of the largest and of the smallest eigenvalue to the middle one.
+
+    Parameters
+    ----------
+    own : (3, ...), errors of the deviations to first order, over those with noise that is alike in all directions.
+    components : see `block_components`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> found = of_gaps(np.array([1.0, 20.0]), np.array([1.0, 20.0]), np.ones((3, 2)), 8.0)
     >>> found.half[0].round(1).tolist(), bool(found.middle[0, 0] < -1)
     ([0.7, 0.9], True)
     """
-    one, other = (_shifts(*gaps) for gaps in ((first, second), (second, first)))
+    one, other = (_shifts(*gaps, components) for gaps in ((first, second), (second, first)))
+    own = np.maximum(own, LEAST_OWN)
     # The smallest is the largest of the matrix with the opposite sign, and the middle one stays the middle one.
-    low, high = np.stack([one[0], one[4], -other[1]]), np.stack([one[1], -other[4], -other[0]])
-    low_95, high_95 = np.stack([one[2], one[5], -other[3]]), np.stack([one[3], -other[5], -other[2]])
+    low, high = own * np.stack([one[0], one[4], -other[1]]), own * np.stack([one[1], -other[4], -other[0]])
+    low_95, high_95 = own * np.stack([one[2], one[5], -other[3]]), own * np.stack([one[3], -other[5], -other[2]])
     # What the three add up to is known.
     middle = (low + high) / 2
     middle -= middle.mean(axis=0)
     return Sorted(middle, (high - low) / 2, middle - low_95, high_95 - middle)
 
 
-def _shifts(first: Array, second: Array) -> NDArray[np.float64]:
+def _shifts(first: Array, second: Array, components: float) -> NDArray[np.float64]:
     """Of the largest lower and upper bound at 68, then at 95 %; of the middle one the lower bounds: (6, ...)."""
     places = [np.interp(np.nan_to_num(gap), GAPS, np.arange(len(GAPS))).reshape(-1) for gap in (first, second)]
+    node = np.full(first.size, np.interp(components, COMPONENTS, np.arange(len(COMPONENTS))))
     out = np.empty((6, first.size))
-    interpolate(_table(), np.stack([np.zeros(first.size), *places]), out)
+    interpolate(_table(), np.stack([node, *places]), out)
     return out.reshape(6, *first.shape)
 
 
 @cache
 def _table() -> NDArray[np.float64]:
     with np.load(TABLE) as stored:
-        return np.ascontiguousarray(np.moveaxis(stored["shifts"], 0, -1)[None], dtype=float)
+        return np.ascontiguousarray(np.moveaxis(stored["shifts"], 1, -1), dtype=float)

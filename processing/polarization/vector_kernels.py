@@ -57,15 +57,16 @@ def _moments(c, v, out, p):  # type: ignore[no-untyped-def]
     by = np.empty(n, np.float32)
     total, square, along, size = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
     for i in range(n):
-        for j in range(i):
-            c[j, i] = c[i, j]
-    for i in range(n):
+        by[i] = c[i, i] * v[i]
         total += c[i, i]
         size += v[i] * v[i]
-        by[i] = 0
-        for j in range(n):
+        square += c[i, i] * c[i, i] / 2
+        for j in range(i):
             square += c[i, j] * c[i, j]
             by[i] += c[i, j] * v[j]
+            by[j] += c[i, j] * v[i]
+    square *= 2
+    for i in range(n):
         along += by[i] * v[i]
     along /= size
     out[0, p], out[1, p], out[2, p] = along, total, square
@@ -73,17 +74,20 @@ def _moments(c, v, out, p):  # type: ignore[no-untyped-def]
     for i in range(n):
         by[i] -= along * v[i]
         turned += by[i] * by[i]
-    # The direction to which noise along v turns it, and the noise along that.
-    if turned > 0:
+    mixed = np.sqrt(turned / size)
+    # By how much noise along v turns it, and, where that matters, the noise along the direction to which it does.
+    turn = DEVIATES[1] * mixed / np.sqrt(along * size)
+    if turn * (2 * mixed + turn * total) >= _ALIKE * along:
         for i in range(n):
-            for j in range(n):
-                across += by[i] * c[i, j] * by[j]
+            across += c[i, i] * by[i] * by[i]
+            for j in range(i):
+                across += 2 * by[i] * c[i, j] * by[j]
         across /= turned
-    _reach(np.sqrt(size), along, np.sqrt(turned / size), across, out[3:5, p])
+    _reach(np.sqrt(size), along, mixed, across, out[3:5, p])
     place = 5
     for apart in range(3):
         for i in range(3 - apart):
-            out[place, p] = c[i, i + apart] if i + apart < n else np.nan
+            out[place, p] = c[i + apart, i] if i + apart < n else np.nan
             place += 1
 
 

@@ -14,7 +14,7 @@ from processing.arrays import Array
 from processing.errors import NotDetermined
 from processing.reflectance.base import kinds
 
-#: A constant counts as identified when its standard error is below this part of it.
+#: A constant counts as identified when its standard error is below this part of it; n, of n - 1.
 RELATIVE_LIMIT = 0.3
 #: Standard deviation of the small eigenvalues from their mean, of the sum of all four: 3 % apart, as of the paper's
 #: sphere at 662 nm, is 0.012.
@@ -204,7 +204,9 @@ def result_of(
             departure = bread @ departures.T @ departures @ bread
     systematic = off.T @ off
     stderr = np.sqrt(np.diag(covariance + departure + systematic))
-    limit = np.maximum(RELATIVE_LIMIT * np.abs(found), of.small)
+    # What n does to light is in proportion to n - 1, and so is its error.
+    effect = np.abs(found - np.eye(len(found))[0])
+    limit = np.maximum(RELATIVE_LIMIT * effect, of.small)
     # k and a may well be 0; an n at the end of its range is no surface, and what was fitted beside it means nothing.
     identified = {name: bool(s <= m and inside[0]) for name, s, m in zip(of.names, stderr, limit, strict=True)}
     return MaterialFit(

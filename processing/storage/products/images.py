@@ -230,6 +230,15 @@ class MuellerImage:
         found = np.einsum("np,np,np->p", seen, seen, variance)
         return np.asarray((found * self._told).reshape(self.mask.shape))
 
+    def covariance_with(self, gradient: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Covariance (rows, columns, 16) of the elements with a quantity of gradient (rows, columns, 16)."""
+        g = np.asarray(gradient).reshape(-1, 16)
+        if self.facts["weighted"]:
+            return np.asarray((self._covariance.reshape(-1, 16, 16) @ g[:, :, None]).reshape(gradient.shape))
+        drive, variance = self._sources
+        found = drive @ (variance * (drive.T @ g.T.astype(np.float32)))
+        return np.asarray((found * self._told).T.reshape(gradient.shape), dtype=float)
+
     def covariances_between(self, pairs: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
         """Covariances (pairs, pixels) of elements, given by their numbers in row-major order; counts^2."""
         first, second = np.array(pairs).T
