@@ -7,7 +7,6 @@ import logging
 import os
 import subprocess
 import threading
-import urllib.request
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import datetime
@@ -83,9 +82,10 @@ class Notifier(Observer):
     def _post(self, config: NotifyConfig, message: Mapping[str, Any]) -> None:
         if config.webhook is None:
             return
-        request = urllib.request.Request(
-            config.webhook, json.dumps(message).encode(), {"Content-Type": "application/json"}
-        )
+        import urllib.request
+
+        content = json.dumps(message).encode()
+        request = urllib.request.Request(config.webhook, content, {"Content-Type": "application/json"})
         try:
             urllib.request.urlopen(request, timeout=PATIENCE_S).close()
         except (OSError, ValueError) as error:

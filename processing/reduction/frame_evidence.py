@@ -15,8 +15,6 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import dctn, idctn
-from scipy.special import digamma, polygamma, stdtrit
 
 from processing.arrays import Array
 from processing.storage.captures.capture import Capture
@@ -286,6 +284,10 @@ def _mirrored_alone(rows: Array, blocks: Array) -> tuple[int, str] | None:
     far the state's own part stays behind its prediction is held against the residuals of the others: Student's t, with
     a variance that all odd cosines share. Each counts by the part of its power that is not noise (Wiener).
     """
+    # A program that takes a capture begins earlier without these libraries, which its end asks for.
+    from scipy.fft import dctn, idctn
+    from scipy.special import stdtrit
+
     n, best = len(rows), (np.inf, 0, "")
     cosines = dctn(blocks, axes=(1, 2), norm="ortho").reshape(n, -1)
     # Each cosine is even or odd under a mirror.
@@ -331,6 +333,8 @@ def _common_variance(variances: Array, freedom: int) -> tuple[float, float]:
     The less their logarithms scatter beyond chance, the more each learns from all (Smyth, Stat. Appl. Genet. Mol. Biol.
     3, 3, 2004).
     """
+    from scipy.special import digamma, polygamma
+
     logs = np.log(np.maximum(variances, np.finfo(float).tiny)) - digamma(freedom / 2) + np.log(freedom / 2)
     excess = float(logs.var(ddof=1) - polygamma(1, freedom / 2))
     # The inverse of the trigamma function, to 10 %.
