@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from processing.diagnosis.instrument.edges import at_edges
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.unevenness import Evenness
 from processing.diagnosis.search.candidate import Candidate
@@ -15,6 +16,8 @@ from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import (
     BOUND,
     CERTAIN,
+    EDGES,
+    LIMIT,
     OUTSTANDING,
     SURE,
     TESTABLE,
@@ -22,10 +25,14 @@ from processing.diagnosis.search.rules import (
     UNEVEN_SHARE,
 )
 
+#: The image does not move where that would be seen best.
+STANDS = "the edges, which were left out of the fit, do not move as it says"
 #: Optics, mechanics and detector are the same for the whole image.
 NOT_ALIKE = "it differs from part to part of the image, which this effect does not"
 #: [log odds, fixed] Of 99 to 1.
 STANDS_OUT = float(np.log(SURE / (1 - SURE)))
+#: Reasons that say that something else is there, of which what the cause explains is left over.
+ELSE = (STANDS, NOT_ALIKE)
 #: The reason for which nothing is written for later captures: the sample or its light changed, and what is found beside
 #: that may be a part of it.
 OF_THE_SAMPLE = "it differs from part to part of the image, which a source does not"
@@ -40,13 +47,14 @@ def doubts(
 ) -> dict[Cause, str]:
     """Reasons by cause; a cause without one may be called by its name. `left` is the chi-square of structure."""
     out: dict[Cause, str] = {}
+    still = _standing(problem, solved, causes)
     even = Evenness(problem, solved.space, solved.fit.values)
     for cause in causes:
-        reason = _of_itself(problem, solved, cause, causes=causes, even=even)
+        reason = STANDS if cause in still else _of_itself(problem, found, solved, cause, causes=causes, even=even)
         if reason is not None:
             out[cause] = reason
-    # What is something else took away a part of what is left over; less than that may be chance.
-    another = [c.log_odds for c, why in out.items() if why == NOT_ALIKE and c.log_odds > STANDS_OUT]
+    # What is something else took away a part of what is left over.
+    another = [c.log_odds for c, why in out.items() if why in ELSE and c.log_odds > STANDS_OUT]
     left += 2 * found.samples.best.unit * sum(another)
     for rank, cause in enumerate(causes, 1):
         if problem.noise_known:
@@ -66,6 +74,7 @@ def doubts(
 
 def _of_itself(
     problem: InstrumentProblem,
+    found: Posterior,
     solved: Solution,
     cause: Cause,
     *,
@@ -87,6 +96,17 @@ def _of_itself(
     if not alike and any(_uneven(even, solved, c, cause) for c in cause.candidates):
         return NOT_ALIKE
     return None
+
+
+def _standing(problem: InstrumentProblem, solved: Solution, causes: Sequence[Cause]) -> list[Cause]:
+    """Shifts of which the edges show too little: an image that moves does so at its edges too."""
+    shifts = [c for c in causes if c.candidates[0].moves_image]
+    shifts = [c for c in shifts if all(one in solved.space.candidates for one in c.candidates)]
+    if not shifts or not problem.noise_known:
+        return []
+    edges = at_edges(problem, solved.space, solved.fit.values, [c.candidates for c in shifts])
+    most = edges.share + LIMIT * edges.error
+    return [c for c, share in zip(shifts, most, strict=True) if share < EDGES or edges.explained < EDGES]
 
 
 def testable(problem: InstrumentProblem, solved: Solution, cause: Cause, causes: Sequence[Cause]) -> bool:

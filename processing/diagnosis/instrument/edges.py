@@ -1,0 +1,114 @@
+"""Do the sharp edges that the fit left out move as far as the inside of the image says?
+
+What is smooth tells a shift only by its slope, and light that is added, or a spot whose brightness changes, has slopes
+too: a weak second image at a distance r changes a slope as a shift by its share of r would. At an edge an image that
+moves changes much, a spot nothing, and a second image changes what is beside the edge instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.diagnosis.instrument.features import inside
+from processing.diagnosis.instrument.pixel_sums import Pixels
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.range_of import range_of
+from processing.diagnosis.search.rules import LIMIT
+from processing.diagnosis.search.space import Space
+
+#: [pixels] At edges, from which on they are asked.
+FEWEST_AT_EDGES = 10
+
+
+@dataclass(frozen=True)
+class AtEdges:
+    """What the edges say of some shifts, all of them fitted to the edges at once.
+
+    Attributes
+    ----------
+    share, error : (S,) how much of each shift they show: one where they move as the values say, half of that where the
+        image is sharper than its pixels resolve, zero where they do not move. The error is infinite where none tell.
+    explained : part of what is left at the edges beyond noise that moves so; one where nothing is left.
+    """
+
+    share: Array
+    error: Array
+    explained: float
+
+
+def at_edges(problem: InstrumentProblem, space: Space, values: Array, shifts: Sequence[Sequence[Candidate]]) -> AtEdges:
+    """What the edges of all captures say of the shifts of the candidates given, at the values (K,) of a space."""
+    n = len(shifts)
+    curvature, along, square, count, noise = np.zeros((n, n)), np.zeros(n), 0.0, 0, 0.0
+    for k in range(len(problem.still)):
+        seen = _of_capture(problem, k, space, values, shifts=shifts)
+        if seen is not None:
+            changes, left, expected = seen
+            curvature += changes @ changes.T
+            along += changes @ left
+            square, count, noise = square + float(left @ left), count + left.size, noise + expected
+    share, error = np.zeros(n), np.full(n, np.inf)
+    there = np.diag(curvature) > 0
+    if there.any():
+        inverse = np.linalg.pinv(curvature[np.ix_(there, there)], hermitian=True)
+        share[there] = inverse @ along[there]
+        # What else an edge does (interpolation fails there) is no noise, but no shift either.
+        unit = max(1.0, (square - along @ share) / count)
+        error[there] = np.sqrt(unit * np.diag(inverse))
+    beyond = square - noise
+    clear = beyond > LIMIT * np.sqrt(2 * max(noise, 1.0))
+    return AtEdges(share, error, float(along @ share) / beyond if clear else 1.0)
+
+
+def _of_capture(
+    problem: InstrumentProblem, k: int, space: Space, values: Array, *, shifts: Sequence[Sequence[Candidate]]
+) -> tuple[Array, Array, float] | None:
+    """What each shift (S, P) would leave over at the edges of a capture, what is left (P,), and the square of noise.
+
+    All in units of the noise.
+    """
+    data, moments = problem.still[k], problem.moments[k]
+    if data.steep is None:
+        return None
+    edge = data.steep & inside(*data.steep.shape) & ~data.clipped
+    if edge.sum() < FEWEST_AT_EDGES:
+        return None
+    here = [[c for c in group if c.acts(k, data.wavelength_nm)] for group in shifts]
+    without = _without(space, values, [c for group in here for c in group])
+    changes = problem.changes(k, space, without)
+    rest_px = changes.shift_px / data.pitch
+    rows, sigma, use = data.values_per_pixel, moments.sigma.astype(np.float32)[:, None, None], moments.counts
+    images = data.moved_back(rest_px + problem.own_px[k]).signal.reshape(rows, *edge.shape) / sigma
+    q = range_of(problem.columns(k, changes) * use[:, None]).astype(np.float32)
+    fitted = (q @ (q.T @ images.reshape(rows, -1))).reshape(images.shape)
+    pixels = Pixels(data)
+    scale, free = np.sqrt(pixels.scale[edge]), 1 - np.sum(q * q, axis=1)
+    noise = 0.0
+    for n in map(int, np.flatnonzero(use)):
+        noise += float(free[n] * np.sum(pixels.variance_of(n)[edge] / (sigma[n] * scale) ** 2))
+    out = np.zeros((len(shifts), int(use.sum()) * int(edge.sum())))
+    for s, group in enumerate(here):
+        if not group:
+            continue
+        others = _without(space, values, [c for each in here if each is not group for c in each])
+        own_px = problem.changes(k, space, others).shift_px / data.pitch - rest_px
+        frames = (fitted * sigma).reshape(data.signal.shape)
+        moved = replace(data, signal=frames, true_variance=None).moved_back(-own_px).signal
+        change = moved.reshape(images.shape)[:, edge] / sigma[:, :, 0] - fitted[:, edge]
+        change -= q @ (q.T @ change)
+        out[s] = (change / scale)[use].reshape(-1)
+    return out, ((images - fitted)[:, edge] / scale)[use].reshape(-1), noise
+
+
+def _without(space: Space, values: Array, candidates: Sequence[Candidate]) -> Array:
+    """The values with those of some candidates at zero."""
+    out = values.copy()
+    for candidate, part in space.pairs:
+        if candidate in candidates:
+            out[part] = 0.0
+    return out
