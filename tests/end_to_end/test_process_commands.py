@@ -128,6 +128,7 @@ def test_bad_options(measured: Measured, instrument: Path, process: Run, tmp_pat
     code, _, err = process("import", *options, "--wavelength-nm", 662, "--sample", "glass")
     assert code == 2
     assert "--sample glass: neither air, mirror, unknown" in err
+    assert "give --sample unknown, and its name with --title" in " ".join(err.split())
     code, _, err = process("import", *options, "--wavelength-nm", 662, "--gain-e-per-count", -1)
     assert code == 2
     broken = tmp_path / "broken.yaml"

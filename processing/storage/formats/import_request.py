@@ -79,7 +79,8 @@ def read_sample(text: str) -> Sample:
             values = np.array(read_text(path, ImportFailed, MOST_SAMPLE_BYTES).replace(",", " ").split(), dtype=float)
     except (ImportFailed, ValueError) as error:
         raise ImportFailed(
-            f"--sample {text}: neither air, mirror, unknown nor a readable file of numbers ({one_line(error)})"
+            f"--sample {text}: neither air, mirror, unknown nor a readable file of numbers ({one_line(error)}). "
+            "Of a sample that is to be measured give --sample unknown, and its name with --title."
         ) from error
     if values.size != 16 or not np.all(np.isfinite(values)):
         raise ImportFailed(f"--sample {text}: a Mueller matrix has 16 finite numbers; found {values.size}")
