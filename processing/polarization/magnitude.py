@@ -20,11 +20,9 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.computing.threads import for_ranges
-from processing.polarization.vector_kernels import DEVIATES, lengths
+from processing.polarization.vector_kernels import DEVIATES, LEAST, lengths
 
 LEVELS = (0.68268949, 0.95)
-#: Error at least, in units of the noise: an observed length far below what noise alone makes allows hardly any length.
-LEAST = 0.55
 #: Half the 95 % interval of a normal distribution, in standard deviations.
 NORMAL_95 = DEVIATES[1]
 #: Nodes of the table; `ALONG` is over sqrt(components).
@@ -76,7 +74,6 @@ def interval(
     out = np.empty((4, length.size))
     table, nodes = _table()[0], (COMPONENTS, ALONG, OBSERVED)
     for_ranges(length.size, lambda start, stop: lengths(table, nodes, flat, out, start, stop))
-    out[1] = np.maximum(out[1], LEAST * np.sqrt(flat[3] / flat[2]))
     return Interval(*out.reshape(4, *length.shape))
 
 

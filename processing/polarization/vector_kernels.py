@@ -8,10 +8,13 @@ from processing.computing.compiling import njit
 
 #: Of the 68 and 95 % interval.
 DEVIATES = (1.0, 1.959964)
+#: Error of a short length at least, in units of the noise: an observed one far below what noise alone makes allows
+#: hardly any length.
+LEAST = 0.55
 #: Newton's method: steps at most, and relative error at which it ends.
-_STEPS, _CLOSE = 6, 1e-3
+_STEPS, _CLOSE = 6, 3e-3
 #: A variance that changes by less than this part is taken as it is.
-_ALIKE = 0.04
+_ALIKE = 0.08
 
 _jit = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"})
 
@@ -177,7 +180,8 @@ def lengths(table, nodes, given, out, start, stop):  # type: ignore[no-untyped-d
         else:
             # Of an upper limit alone the value goes to zero with what is observed.
             value = min(high * high / _at(table[4], i, x, j, y, k, z), high) / 2
-        out[0, p], out[1, p] = value * unit, (high - value) * unit
+        error = max(high - value, LEAST) if seen < farthest else high - value
+        out[0, p], out[1, p] = value * unit, error * unit
         out[2, p], out[3, p] = max(ends[2], 0.0) * unit, ends[3] * unit
 
 
