@@ -21,7 +21,7 @@ from processing.polarization.magnitude import NORMAL_95, directions, interval, p
 from processing.polarization.propagation import Derived
 from processing.polarization.quantities import entropy
 from processing.polarization.sorted_eigenvalues import of_gaps
-from processing.polarization.vector_noise import of_elements, of_slopes
+from processing.polarization.vector_noise import VectorNoise, of_elements, of_slopes
 from processing.reduction.systematic import Systematic
 from processing.storage.products.images import MuellerImage
 
@@ -90,7 +90,13 @@ class ElementNoise(Protocol):
 
 
 def set_magnitudes(
-    planes: Planes, derived: Mapping[str, Derived], m: Array, image: ElementNoise, *, widened: Array | float = 1.0
+    planes: Planes,
+    derived: Mapping[str, Derived],
+    m: Array,
+    image: ElementNoise,
+    *,
+    widened: Array | float = 1.0,
+    known: Mapping[str, VectorNoise] | None = None,
 ) -> None:
     """Replace value and error of every length of a vector and of every angle, and add their 95 % intervals.
 
@@ -98,6 +104,7 @@ def set_magnitudes(
     ----------
     m : (..., 4, 4), the matrices of which `derived` is.
     widened : (...), factor by which the errors of the dominant process are larger than to first order.
+    known : noise of vectors that is known already, by the name of their length.
     """
     covariance = image.covariance()
     for name, quantity in derived.items():
@@ -110,7 +117,7 @@ def set_magnitudes(
             scale = np.square(quantity.value * m[..., 0, 0]) / np.square(vector).sum(axis=0)
         else:
             vector, scale = quantity.parts.value, np.ones(())
-            noise = of_slopes(covariance, vector, quantity.parts.gradient)
+            noise = (known or {}).get(name) or of_slopes(covariance, vector, quantity.parts.gradient)
         if name.startswith("dominant_"):
             scale = scale * np.square(widened)
         length = np.asarray(quantity.value, dtype=float)

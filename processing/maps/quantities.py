@@ -42,7 +42,7 @@ from processing.polarization.propagation import Derived
 from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.scalar_files import scalar_quantities
 from processing.polarization.sorted_eigenvalues import block_components
-from processing.polarization.vector_noise import of_slopes
+from processing.polarization.vector_noise import VectorNoise, of_slopes
 from processing.reduction.mueller import Progress
 from processing.reduction.systematic import INPUTS, Systematic
 from processing.storage.products.images import MuellerImage, require_all_elements, seen_elements
@@ -225,9 +225,11 @@ def quantities_block(
             each = gradient.reshape(-1, *m.shape[:2], 16)
             errors = [np.sqrt(image.variance_of(g)) for g in each]
             found[f"{name}_errors"] = np.stack(errors).reshape(value.shape).astype(np.float32)
-        found["retardance_vector_covariance"] = _packed(image, derived["retardance_vector_deg"])
+        vector = derived["retardance_vector_deg"]
+        retardance = of_slopes(image.covariance(), vector.value, vector.gradient)
+        found["retardance_vector_covariance"] = retardance.packed[[0, 1, 2, 3, 5, 4]].astype(np.float32)
         polar = lu_chipman(m)
-        _set_intervals(found, derived, m, image, depolarizer=polar.depolarizer)
+        _set_intervals(found, derived, m, image, depolarizer=polar.depolarizer, retardance=retardance)
         if moves is not None:
             moved = set_systematic(found, derived, moves)
             if by_input is not None:
@@ -249,6 +251,7 @@ def _set_intervals(
     image: MuellerImage | ExtrapolatedImage,
     *,
     depolarizer: NDArray[np.floating],
+    retardance: VectorNoise,
 ) -> None:
     """What first order does not give: see `processing.maps.intervals`."""
     error, linear_error = found["retardance_deg_errors"], found["retardance_linear_deg_errors"]
@@ -267,7 +270,7 @@ def _set_intervals(
         uneven = np.sqrt(8 / components)
         shrunk = set_eigenvalues(found, noise, xi0, components)
         factor = widen_dominant(found, noise, uneven)
-    set_magnitudes(found, derived, m, image, widened=factor)
+    set_magnitudes(found, derived, m, image, widened=factor, known={"retardance_deg": retardance})
     if isinstance(image, MuellerImage):
         set_any_dominant(found, derived, np.isfinite(factor))
         set_entropy(found, shrunk, xi0)
@@ -303,12 +306,6 @@ def _symmetric_eigenvalues(a: NDArray[np.floating]) -> NDArray[np.float64]:
     determinant = np.einsum("...i,...i->...", x, np.cross(y, z))
     turn = np.arccos(np.clip(np.nan_to_num(determinant / (2 * size**3)), -1, 1)) / 3
     return np.stack([mean + 2 * size * np.cos(turn + 2 * np.pi * k / 3) for k in range(3)])
-
-
-def _packed(image: MuellerImage | ExtrapolatedImage, vector: Derived) -> NDArray[np.float32]:
-    """Covariance (6, rows, columns) of a vector of three components: 00, 11, 22, 01, 02, 12."""
-    packed = of_slopes(image.covariance(), vector.value, vector.gradient).packed
-    return packed[[0, 1, 2, 3, 5, 4]].astype(np.float32)
 
 
 def _relative_error(image: MuellerImage | ExtrapolatedImage) -> NDArray[np.float64]:

@@ -95,6 +95,14 @@ def test_an_interval_of_a_length_covers_at_every_length(components: int, length:
     assert np.mean(np.abs(found.value - length) <= found.error) == pytest.approx(0.69, abs=0.05)
 
 
+def test_a_long_vector_with_little_noise_along_it_has_its_own_error() -> None:
+    """That of a polarizer's diattenuation was more than half of the noise across it, and covered 100 %."""
+    noise = np.random.default_rng(1).normal(size=(2, 20_000)) * [[0.1], [1.0]]
+    seen, one = np.hypot(50 + noise[0], noise[1]), np.ones(20_000)
+    found = interval(seen, 0.01 * one, 1.01 * one, 1.0001 * one)
+    assert np.mean(np.abs(found.value - 50) <= found.error) == pytest.approx(0.683, abs=0.02)
+
+
 @pytest.mark.parametrize(("components", "off_68", "off_95"), [(8.0, 0.04, 0.025), (3.0, 0.05, 0.03), (1.5, 0.05, 0.03)])
 @pytest.mark.parametrize("gaps", [(0, 0), (1, 0), (0.5, 3), (3, 0), (2, 2), (8, 2), (30, 0), (0, 30)])
 def test_intervals_of_eigenvalues_cover_at_every_gap(
