@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import betaln
 
-from processing.diagnosis.search.averages import stay
+from processing.diagnosis.search.averages import sample, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import minimize
@@ -34,7 +34,8 @@ def groups(*sizes):
     return [Group(np.arange(end - size, end)) for size, end in zip(sizes, ends, strict=True)]
 
 
-def test_probabilities_are_those_of_all_sets():
+@pytest.mark.parametrize("average", [sample, stay])
+def test_probabilities_are_those_of_all_sets(average):
     random = np.random.default_rng(3)
     design = random.standard_normal((40, 5)) * np.array([6, 6, 3, 3, 2])
     # Two that are nearly the same, one that is there, one of two values that is weak.
@@ -46,7 +47,7 @@ def test_probabilities_are_those_of_all_sets():
         there.append(np.array(tau) > 0)
     weight = np.exp(np.array(scores) - max(scores))
     exact = weight @ np.array(there) / weight.sum()
-    found = stay(sets, likely_set(sets), 800)
+    found = average(sets, likely_set(sets), 800)
     assert found.probability == pytest.approx(exact, abs=0.08)
     # Which of the two alike is open, that one is there is not.
     assert 0.05 < exact[0] < 0.999
@@ -115,7 +116,7 @@ def test_the_mean_is_nearer_to_the_truth_than_the_data_are():
     truth = 0.05 * random.standard_normal(40)
     design = np.vstack([np.eye(40) * 10.0])
     sets = Sets(form(design, truth), groups(40), QUIET)
-    found = stay(sets, likely_set(sets), 50)
+    found = sample(sets, likely_set(sets), 50)
     alone = -np.linalg.solve(sets.form.curvature, sets.form.gradient)
     assert np.linalg.norm(found.mean - truth) < 0.7 * np.linalg.norm(alone - truth)
 
@@ -125,7 +126,7 @@ def test_nothing_is_there_where_nothing_is():
     design = 30 * random.standard_normal((200, 60))
     for seed in range(5):
         sets = Sets(form(design, np.zeros(60), seed), groups(*[1] * 40, *[4] * 5), QUIET)
-        assert stay(sets, likely_set(sets), 100).probability.max() < 0.9
+        assert sample(sets, likely_set(sets), 100).probability.max() < 0.9
 
 
 def test_several_causes_that_are_plain_only_together_are_found():
@@ -150,12 +151,13 @@ def test_structure_that_no_set_explains_widens_the_errors():
     assert not state.tau[1:].any()
 
 
-def test_two_that_say_the_same_share_the_mean():
+@pytest.mark.parametrize("average", [sample, stay])
+def test_two_that_say_the_same_share_the_mean(average):
     random = np.random.default_rng(17)
     design = 100 * random.standard_normal((90, 60))
     design[:, 1] = design[:, 0]
     sets = Sets(form(design, np.eye(60)[0] + np.eye(60)[5] - np.eye(60)[7]), groups(*[1] * 60), QUIET)
-    found = stay(sets, likely_set(sets), 1500)
+    found = average(sets, likely_set(sets), 1500)
     assert found.probability[:2] == pytest.approx(0.5, abs=0.15)
     assert found.mean[:2] == pytest.approx(0.5, abs=0.15)
 
@@ -186,8 +188,8 @@ def test_of_those_that_may_be_there_alone_never_two_are():
     assert likely_set(Sets(quadratic, groups(*(1,) * 6), sets.noise)).tau[:2].all()
     state = likely_set(sets)
     assert np.sum(state.tau[:2] > 0) == 1
-    samples = stay(sets, state, 400)
-    assert float(samples.weight @ samples.sets[:, :2].all(axis=1)) == 0
+    for samples in (sample(sets, state, 200), stay(sets, state, 400)):
+        assert float(samples.weight @ samples.sets[:, :2].all(axis=1)) == 0
 
 
 def test_the_state_that_a_slip_begins_at_is_one_of_those_that_the_data_leave_open():

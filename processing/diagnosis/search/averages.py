@@ -1,7 +1,9 @@
 """Averages over sets of groups, each weighted by its probability.
 
-A Gibbs chain in continuous time (Bortz, Kalos and Lebowitz, J. Comput. Phys. 17, 10, 1975), in which a set counts by
-how long the chain stays there. That includes the many sets that are unlikely one by one.
+Where the noise is unknown, and in the rounds before the last: weighted tempered Gibbs sampling (Zanella and Roberts,
+J. R. Stat. Soc. B 81, 489, 2019). The chain only finds the sets; each counts once, by its evidence. Where the noise
+is known: a Gibbs chain in continuous time (Bortz, Kalos and Lebowitz, J. Comput. Phys. 17, 10, 1975), in which a set
+counts by how long the chain stays there. That includes the many sets that are unlikely one by one.
 """
 
 from __future__ import annotations
@@ -18,6 +20,8 @@ from processing.diagnosis.search.sets import Conditional, Group, Quadratic, Sets
 
 #: [probability] Weight of a set below which it changes no mean.
 LEAST_WEIGHT = 1e-6
+#: [of its probability] How often a group is asked at least, relative to one that is there half of the time.
+LEAST_INTEREST = 0.04
 #: [groups] That are tried in the place of one.
 MOST_RIVALS = 8
 
@@ -43,6 +47,65 @@ class Samples:
     def any_of(self, members: Sequence[int]) -> float:
         """Probability that at least one of some groups is there."""
         return float(self.weight @ self.sets[:, list(members)].any(axis=1))
+
+
+class _ByEvidence:
+    """Every set that was visited counts once, by how likely it is."""
+
+    def __init__(self, sets: Sets) -> None:
+        self._sets = sets
+        self._seen: dict[bytes, tuple[float, Conditional, State, Array]] = {}
+
+    def add(self, c: Conditional, state: State, chance: Array) -> None:
+        key = (state.tau > 0).tobytes()
+        if key not in self._seen or c.score > self._seen[key][0]:
+            self._seen[key] = (c.score, c, state.copy(), chance)
+
+    @property
+    def best(self) -> State:
+        """The likeliest set so far."""
+        return max(self._seen.values(), key=lambda v: v[0])[2]
+
+    def samples(self) -> Samples:
+        seen = sorted(self._seen.values(), key=lambda v: -v[0])
+        weight = np.exp(np.array([v[0] for v in seen]) - seen[0][0])
+        weight /= weight.sum()
+        probability = np.zeros(len(self._sets.groups))
+        size = self._sets.size
+        mean, second = np.zeros(size), np.zeros((size, size))
+        for w, (_, c, _, chance) in zip(weight, seen, strict=True):
+            if w < LEAST_WEIGHT:
+                break
+            probability += w * chance
+            mean[c.active] += w * c.mean
+            second[np.ix_(c.active, c.active)] += w * (c.covariance + np.outer(c.mean, c.mean))
+        there = np.array([v[2].tau > 0 for v in seen])
+        return Samples(probability, mean, second - np.outer(mean, mean), there, weight, seen[0][2])
+
+
+def sample(sets: Sets, state: State, visits: int, seed: int = 0) -> Samples:
+    """Average over sets, from a likely one on; the unit of chi-square stays that of the first."""
+    random = np.random.default_rng(seed)
+    state, average = state.copy(), _ByEvidence(sets)
+    interest = np.full(len(sets.groups), LEAST_INTEREST / 2)
+    for _ in range(visits):
+        c = sets.conditional(state)
+        present = state.tau > 0
+        chance = chance_of(sets, c)
+        average.add(c, state, chance)
+        now = np.where(present, chance, 1 - chance)
+        rate = np.where(sets.free, interest / np.maximum(now, 1e-12), 0.0)
+        if not rate.any():
+            break
+        interest = np.maximum(interest, np.minimum(chance, 0.5) * sets.free)
+        k = int(random.choice(rate.size, p=rate / rate.sum()))
+        there = random.random() < 0.5
+        state.tau[k] = sets.taus[int(random.choice(sets.taus.size, p=c.tau_weights[k]))] if there else 0.0
+    # Where what is left is the noise, a set that leaves less has a smaller unit, and must be passed to step by step.
+    for other in swapped(sets, average.best) if sets.noise.known else ():
+        c = sets.conditional(other)
+        average.add(c, other, chance_of(sets, c))
+    return average.samples()
 
 
 def chance_of(sets: Sets, c: Conditional) -> Array:

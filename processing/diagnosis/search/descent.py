@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.search.averages import Samples, stay
+from processing.diagnosis.search.averages import Samples, sample
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import minimize
-from processing.diagnosis.search.rules import CHANGES_BEFORE, NOMINAL_TAU, TAKES_PART
+from processing.diagnosis.search.rules import NOMINAL_TAU, SAMPLES_BEFORE, TAKES_PART
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Problem, Space
 
@@ -51,7 +51,7 @@ def all_at_once(
 
 def next_values(problem: Problem, space: Space, sets: Sets, state: State, *, x: Array) -> tuple[Array, bool]:
     """Values (K,) about which to linearize next, and whether they are so near to x (K,) that there is no need."""
-    samples = stay(sets, state, CHANGES_BEFORE)
+    samples = sample(sets, state, SAMPLES_BEFORE)
     new = improved(problem, space, sets.groups, samples, starts=[mean_over_sets(space, samples, x), x])
     spread = np.sqrt(np.maximum(np.diag(samples.covariance), 1e-12)) * space.joined("typical")
     return new, bool(np.all(np.abs(new - x) < SETTLED * spread))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.search.averages import Samples, stay
+from processing.diagnosis.search.averages import Samples, sample, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.descent import STEPS, all_at_once, improved, mean_over_sets, minimum_of, next_values
 from processing.diagnosis.search.likely_set import likely_set
@@ -25,6 +25,7 @@ from processing.diagnosis.search.rules import (
     FEWER_ROUNDS,
     GROWTH,
     ROUNDS,
+    SAMPLES,
     TAU,
 )
 from processing.diagnosis.search.sets import Group, Sets, State
@@ -91,7 +92,7 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     members, groups = grouped(space, fixed)
     bends = [g for g, own in enumerate(members) if space.candidates[own[0]].is_pointwise]
     about, sets, state, others = _found(problem, space, fixed, groups, start=start, bends=bends)
-    samples = stay(sets, state, CHANGES)
+    samples = _averaged(sets, state)
     there = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(there) or 'nothing'}; unit of chi-square {state.unit:.3g}")
     return _posterior_of(problem, space, members, sets, samples=samples, about=about, others=others)
@@ -214,6 +215,11 @@ def _settled(problem: Problem, space: Space, first: _Round, look: Look, *, round
         now = new
     problem.relinearize(space, now.about)
     return now
+
+
+def _averaged(sets: Sets, state: State) -> Samples:
+    """Average over sets; where what is left is the noise each has a unit of its own, and counts by its evidence."""
+    return stay(sets, state, CHANGES) if sets.noise.known else sample(sets, state, SAMPLES)
 
 
 def _posterior_of(

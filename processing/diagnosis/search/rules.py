@@ -171,5 +171,7 @@ ROUNDS = 7
 FEWER_ROUNDS = 4
 #: [changes] Of a chain in the last round.
 CHANGES = 1000
-#: [changes] Of a chain in the rounds before.
-CHANGES_BEFORE = 80
+#: [sets] That are visited in the last round where what is left is the noise.
+SAMPLES = 300
+#: [sets] That are visited in the rounds before.
+SAMPLES_BEFORE = 80
