@@ -88,7 +88,7 @@ def of_gaps(first: Array, second: Array, own: Array, components: float) -> Sorte
     >>> import numpy as np
     >>> found = of_gaps(np.array([1.0, 20.0]), np.array([1.0, 20.0]), np.ones((3, 2)), 8.0)
     >>> found.half[0].round(1).tolist(), bool(found.middle[0, 0] < -1)
-    ([0.7, 0.9], True)
+    ([0.9, 0.9], True)
     """
     one, other = (_shifts(*gaps, components) for gaps in ((first, second), (second, first)))
     own = np.maximum(own, LEAST_OWN)
