@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -72,12 +72,27 @@ def cells(
     extra: Sequence[str] = EXTRA,
     first_seed: int = 7,
 ) -> Iterator[Cell]:
-    """Every quantity of every sample, or of those named."""
-    w = seven_instruments()[instrument]
+    """Every quantity of every one of the 19 samples, or of those named, seen by one of the seven instruments."""
     matrices = {name: m for name, m in nineteen_samples().items() if not samples or name in samples}
+    seed = [first_seed, darks, int(electrons), list(seven_instruments()).index(instrument)]
+    w = {instrument: seven_instruments()[instrument]}
+    yield from cells_of(matrices, w, darks, electrons, pixels=pixels, extra=extra, seed=seed)
+
+
+def cells_of(
+    matrices: Mapping[str, np.ndarray],
+    instrument: Mapping[str, np.ndarray],
+    darks: int,
+    electrons: float,
+    *,
+    pixels: int,
+    extra: Sequence[str],
+    seed: Sequence[int],
+) -> Iterator[Cell]:
+    """The same of samples (4, 4) by name and of one instrument W (N, 16) by name."""
+    ((name_of_w, w),) = instrument.items()
     stack = np.stack(list(matrices.values()))
     truth = _planes(noisy_image(stack, BRIGHT, 0, w), extra)
-    seed = [first_seed, darks, int(electrons), list(seven_instruments()).index(instrument)]
     found = _planes(noisy_image(np.repeat(stack, pixels, axis=0), electrons, seed, w, darks=darks), extra)
     length_of = {angle: length for length, angles in ANGLES_OF.items() for angle in angles}
     for k, sample in enumerate(matrices):
@@ -120,7 +135,7 @@ def cells(
             inside_68, inside_95 = inside_68 | unknown, inside_95 | unknown
             yield Cell(
                 name,
-                instrument,
+                name_of_w,
                 darks,
                 electrons,
                 sample,

@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import argparse
 from collections import defaultdict
-from unittest import mock
 
-import error_bars
 import numpy as np
+from error_bars import cells_of
 from noisy_images import random_processes, two_plates
 
 from processing.maps.quantities import EXTRA
@@ -74,13 +73,9 @@ if __name__ == "__main__":
     for number in range(arguments.instruments):
         w, samples = instrument(random), {f"sample {k}": sample(random) for k in range(SAMPLES)}
         electrons, darks = float(np.exp(random.uniform(np.log(20), np.log(20_000)))), int(random.choice([0, 1, 4]))
-        with (
-            mock.patch.object(error_bars, "seven_instruments", lambda w=w: {"drawn": w}),
-            mock.patch.object(error_bars, "nineteen_samples", lambda samples=samples: samples),
-        ):
-            seed = 1000 * arguments.seed + number
-            for cell in error_bars.cells("drawn", darks, electrons, arguments.pixels, extra=EXTRA, first_seed=seed):
-                found[cell.quantity].append((cell.in_68, cell.in_95, np.linalg.cond(w) < GOOD_CONDITION))
+        seed = [1000 * arguments.seed + number, darks, int(electrons), 0]
+        for cell in cells_of(samples, {"drawn": w}, darks, electrons, pixels=arguments.pixels, extra=EXTRA, seed=seed):
+            found[cell.quantity].append((cell.in_68, cell.in_95, np.linalg.cond(w) < GOOD_CONDITION))
     print("| quantity | cells | 68 % | 95 % | condition below 20 | 20 to 90 |\n|---|---|---|---|---|---|")
     for name, cells in found.items():
         in_68, in_95, good = 100 * np.array(cells).T

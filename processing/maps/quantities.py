@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from processing.arrays import RealArray
 from processing.errors import ProcessError
 from processing.maps.coherency_noise import coherency_noise
+from processing.maps.eigenvalue_intervals import set_eigenvalues, set_entropy, set_symmetric, widen_dominant
 from processing.maps.extrapolation import EXTRAPOLATED, ExtrapolatedImage
 from processing.maps.intervals import (
     SEEN,
@@ -20,14 +21,10 @@ from processing.maps.intervals import (
     set_any_dominant,
     set_depolarization_power,
     set_differential,
-    set_eigenvalues,
-    set_entropy,
     set_magnitudes,
     set_ratios,
     set_retardance,
-    set_symmetric,
     set_systematic,
-    widen_dominant,
 )
 from processing.maps.partial_quantities import Pairs, determined_maps, partial_block, partial_facts
 from processing.maps.quantity_planes import NOISE, planes_of, with_errors

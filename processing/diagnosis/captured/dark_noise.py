@@ -1,4 +1,4 @@
-"""Noise of the dark frames, which all states of a pixel share: a capture without it has independent noise."""
+"""Noise of the dark frames, which all states of a pixel share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from processing.reduction.measurement_matrix import measurement_matrix
 from processing.reduction.noise import NoiseModel
 from processing.storage.captures.capture import Capture
 
-#: [of the noise of one state] Noise of the dark frames in all states together that changes nothing.
+#: [of the noise of one state] Noise of the dark frames, over all states of a pixel, that changes nothing.
 UNSEEN = 1e-3
 
 
@@ -31,47 +31,58 @@ def without_noise_of_darks(
     black: Black,
     noise: NoiseModel,
 ) -> CaptureData:
-    """The capture with the noise made independent that its dark frames add to all states of a pixel.
+    """The capture without the noise that its dark frames add to all states of a pixel.
 
-    A mean of dark frames is wrong by the same counts in all states of an exposure. Where its error stands out of the
-    noise of a state, it is estimated from what the states of a pixel leave beside the model, and that part is
-    subtracted which makes the rest white. What goes with the light, or is alike in all pixels, is no such noise.
+    A mean of dark frames is wrong by the same counts in all states of an exposure. This error is estimated in each
+    pixel, from what its states leave beside the model. Of the residual only so much is subtracted that the rest is
+    white; of the light, the estimate. Errors that follow the light, or are alike in all pixels, are no such noise.
+
+    Parameters
+    ----------
+    data : its `floor` is the noise of each state alone.
+    model : of the capture, at its wavelength.
+    states : (N,) numbers of the states of `data` in the capture.
     """
-    counts, sd = data.row_counts, np.sqrt(black.mean_variance(noise)) / data.conditions.full_scale / data.binned
+    channels, counts = data.signal.shape[1], data.row_counts
     good = data.usable & ~data.clipped
-    if not good.any() or not sd.any():
+    dark_sd = np.sqrt(black.mean_variance(noise)) / data.conditions.full_scale / data.binned
+    if not good.any() or not dark_sd.any():
         return data
-    channels = data.signal.shape[1]
-    shared = np.kron(black.weights(capture.column("exposure_s")[states]) * sd, np.eye(channels))[counts]
-    a = measurement_matrix(capture, model.model_copy(update={"effects": ()}), states)
-    a = a @ known_mueller(capture.header.sample).reshape(16, 1) if capture.header.sample.kind != "unknown" else a
     y = data.signal.reshape(-1, *data.usable.shape)
-    mean = y[:, good].mean(axis=1, dtype=float)
-    level = np.sqrt(np.repeat(data.slope, channels) * np.maximum(mean, 0) + np.repeat(data.floor, channels))[counts]
-    inside, outside = inside_and_outside(a.reshape(len(y), -1)[counts] / level[:, None])
-    shared /= level[:, None]
-    u, size, of_error = np.linalg.svd(outside @ (outside.T @ shared), full_matrices=False)
-    seen = size > UNSEEN
-    if not seen.any():
+    light = np.maximum(y[:, good].mean(axis=1, dtype=float), 0)
+    sd = np.sqrt(np.repeat(data.slope, channels) * light + np.repeat(data.floor, channels))[counts]
+    # From here on in units of the noise of each state; along each of D dark errors in each channel, of unit variance.
+    dark = (
+        np.kron(black.weights(capture.column("exposure_s")[states]) * dark_sd, np.eye(channels))[counts] / sd[:, None]
+    )
+    inside, outside = inside_and_outside(_rows(capture, model, states)[counts] / sd[:, None])
+    u, size, errors = np.linalg.svd(outside @ (outside.T @ dark), full_matrices=False)
+    visible = size > UNSEEN
+    if not visible.any():
         return data
-    u, size, reached = u[:, seen], size[seen, None], inside @ (inside.T @ (shared @ of_error[seen].T))
-    noise_along = np.sqrt(1 + size**2)
-    z = y[:, good][counts] / level[:, None].astype(np.float32)
-    told, light = u.astype(np.float32).T @ z / noise_along, inside.astype(np.float32).T @ z
-    # Light and residual share the noise of the darks: what is left of the light tells nothing of them.
-    own = light - inside.T @ reached @ (size / noise_along * (told - told.mean(axis=1, keepdims=True)))
-    told = _beside(told, own)
+    u, size, in_light = u[:, visible], size[visible, None], inside @ (inside.T @ (dark @ errors[visible].T))
+    spread = np.sqrt(1 + size**2)
+    z = y[:, good][counts] / sd[:, None].astype(np.float32)
+    residual, fit = u.astype(np.float32).T @ z / spread, inside.astype(np.float32).T @ z
+    # Fit and residual share the dark error. Only a fit without it says what of the residual follows the light.
+    centred = residual - residual.mean(axis=1, keepdims=True)
+    of_dark = _beside(residual, fit - inside.T @ in_light @ (size / spread * centred))
     # A pixel with a hit, or a hot one, tells nothing of its dark frames.
-    told[np.abs(told) > OUTSTANDING] = 0.0
+    of_dark[np.abs(of_dark) > OUTSTANDING] = 0.0
+    subtracted = np.zeros((len(y), of_dark.shape[1]), dtype=np.float32)
+    subtracted[counts] = sd[:, None] * (u @ ((spread - 1) * of_dark) + in_light @ (size / spread * of_dark))
     signal = data.signal.copy()
-    taken = np.zeros((len(y), told.shape[1]), dtype=np.float32)
-    # Along u as much is left as a state has of noise; of what the light takes up, the likeliest is subtracted.
-    taken[counts] = level[:, None] * (u @ (told * (noise_along - 1)) + reached @ (told * size / noise_along))
-    signal.reshape(y.shape)[:, good] -= taken
+    signal.reshape(y.shape)[:, good] -= subtracted
     return replace(data, signal=signal)
 
 
-def _beside(told: Array, light: Array) -> Array:
-    """What of numbers (B, P) is neither alike in all pixels nor goes with the light (K, P)."""
+def _rows(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> Array:
+    """Columns (N x channels, K) that the light of a pixel reaches: all of W, or those of a known sample."""
+    w = measurement_matrix(capture, model.model_copy(update={"effects": ()}), states).reshape(-1, 16)
+    return w if capture.header.sample.kind == "unknown" else w @ known_mueller(capture.header.sample).reshape(16, 1)
+
+
+def _beside(values: Array, light: Array) -> Array:
+    """What of values (B, P) of the pixels is neither alike in all of them nor follows their light (K, P)."""
     known = np.concatenate([np.ones_like(light[:1]), light])
-    return np.asarray(told - (told @ np.linalg.pinv(known)) @ known, dtype=float)
+    return np.asarray(values - (values @ np.linalg.pinv(known)) @ known, dtype=float)
