@@ -104,6 +104,12 @@ def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) 
         if not np.all(np.abs(column) < NO_LIMIT_DEG):
             found = f"{column[np.argmin(np.abs(column) < NO_LIMIT_DEG)]:g} deg; no controller counts so far"
             return [CheckResult(f"angles of {axis}", False, found)]
+        low, high = rig.axes[axis].limits_deg or (None, None)
+        beyond = column[(column < (-np.inf if low is None else low)) | (column > (np.inf if high is None else high))]
+        if beyond.size:
+            ends = " to ".join("no limit" if end is None else f"{end:g}" for end in (low, high))
+            found = f"{beyond[0]:g} {rig.axes[axis].unit}; limits_deg of the rig file is {ends}. Change the plan"
+            return [CheckResult(f"limits of {axis}", False, found + _could_fold(axis, rig))]
     checks = _free_ways(rig, states_deg(table))
     lacking = [axis for axis in instrument.axes if axis not in table.angles_deg]
     if lacking:
@@ -179,7 +185,7 @@ def check_devices(
             for target in column:
                 rig.axes[axis].check(float(target))
         except LimitError as error:
-            checks.append(CheckResult(f"limits of {axis}", False, str(error) + _could_fold(axis, rig)))
+            checks.append(CheckResult(f"limits of {axis}", False, str(error) + _could_fold(axis, rig.config)))
         else:
             ends = f"{column.min():g} to {column.max():g} {rig.config.axes[axis].unit}"
             checks.append(CheckResult(f"limits of {axis}", True, ends))
@@ -208,8 +214,8 @@ def _check_park(rig: Rig) -> list[CheckResult]:
     return failures
 
 
-def _could_fold(axis: str, rig: Rig) -> str:
-    if axis == ARM or axis in rig.config.fold_deg:
+def _could_fold(axis: str, rig: RigConfig) -> str:
+    if axis == ARM or axis in rig.fold_deg:
         return ""
     return (
         f"; `fold_deg: {{{axis}: 180}}` there takes the same state half a turn away, as polarizers and retarders allow"

@@ -115,7 +115,7 @@ def write_report(
         sections.append(section)
         if progress:
             progress(count, len(files))
-    made = f"Made by umov {version('umov')} on {datetime.now(UTC).isoformat(timespec='seconds')}, {len(files)} files."
+    made = f"Made by umov {version('umov')} on {datetime.now(UTC).isoformat(timespec='seconds')}. Files: {len(files)}."
     write_whole_text(out, mark + render(title, simulated, made, sections))
     return out
 

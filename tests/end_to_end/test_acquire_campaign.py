@@ -157,6 +157,8 @@ def test_dry_run_lists_captures_time_space_and_checks(acquire, small_rig, campai
     [
         ({"omega_deg": "[40, 3]"}, ("forbidden", "omega3")),
         ({"omega_deg": "[40, 200]"}, ("limits of arm", "200")),
+        # A turn further than a forbidden pose: not that it meets one.
+        ({"omega_deg": "[40, 400]"}, ("limits of arm", "400")),
         ({"wavelengths_nm": "[662, 500]"}, ("500",)),
         ({"samples": "[{name: gold}]"}, ("gold",)),
         ({"omega_deg": "{start: 90, stop: 20, step: 5}"}, ("stop 20", "start 90")),
