@@ -103,7 +103,8 @@ def words_of(entry: Any, names: Sequence[str] = ()) -> str:
         key = str(entry["loc"][-1])
         meant = get_close_matches(key, [name for name in names if name != key], 1, cutoff=0.75)
         meant += [name for name in names if name.startswith(f"{key}_")]
-        return WORDS[kind] + (f"; is {meant[0]!r} meant?" if meant else "")
+        elsewhere = "; another section may have it" if key in names else ""
+        return WORDS[kind] + (f"; is {meant[0]!r} meant?" if meant else elsewhere)
     if kind == "string_pattern_mismatch" and entry["ctx"]["pattern"] == NAME_PATTERN:
         return "may have letters, digits, - and _ only" + _found(kind, entry)
     if kind in WORDS:

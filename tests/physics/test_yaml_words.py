@@ -95,6 +95,7 @@ def test_a_file_of_another_kind_is_told_by_that_alone():
         ("turned_deg: {start_deg: 0,5}", "turned_deg.step_deg: is missing"),
         ("pets: [{kind: dog, legs: 0,7}]", "pets.0.7: unknown key; decimals take a point, not a comma"),
         ("area: 3", "area: unknown key; is 'area_m2' meant?"),
+        ("legs: 4", "legs: unknown key; another section may have it"),
     ],
 )
 def test_words_of_one_mistake(line, told):
