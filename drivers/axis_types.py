@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
@@ -10,6 +11,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 # Controllers that tell a limit of every stage tell one as large as this where there is none.
 NO_LIMIT_DEG = 1e6
+# Sums of zero and angle in floating point: a target at the limit itself is inside.
+ROUNDING_DEG = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +39,14 @@ class Limits:
 
     min_deg: float | None
     max_deg: float | None
+
+    def __contains__(self, target_deg: float) -> bool:
+        low = -math.inf if self.min_deg is None else self.min_deg - ROUNDING_DEG
+        high = math.inf if self.max_deg is None else self.max_deg + ROUNDING_DEG
+        return low <= target_deg <= high
+
+    def __str__(self) -> str:
+        return " to ".join("no limit" if end is None else f"{end:g}" for end in (self.min_deg, self.max_deg))
 
 
 @dataclass(frozen=True, slots=True)

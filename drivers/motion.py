@@ -31,8 +31,6 @@ SLACK = 1.5
 # Status words can lag behind the start and the end of a motion, and a servo settles: idle off the target
 # counts only when it lasts this long.
 SETTLE_S = 0.3
-# Sums of zero and angle in floating point: a target at the limit itself is inside.
-ROUNDING_DEG = 1e-6
 # A look at the position while moving, for the detection of a stall.
 PROGRESS_EVERY_S = 0.2
 
@@ -225,14 +223,11 @@ class MotionAxis(ABC):
             Outside the limits, not a number, or 1e6 degrees and more, which no controller counts.
         """
         limits = self.limits
-        low = -math.inf if limits.min_deg is None else limits.min_deg - ROUNDING_DEG
-        high = math.inf if limits.max_deg is None else limits.max_deg + ROUNDING_DEG
-        if abs(target_deg) < NO_LIMIT_DEG and low <= target_deg <= high:
+        if abs(target_deg) < NO_LIMIT_DEG and target_deg in limits:
             return
-        ends = " to ".join("no limit" if end is None else f"{end:g}" for end in (limits.min_deg, limits.max_deg))
         raise LimitError(
             f"axis {self.name}, move to {target_deg:g} {self.config.unit}",
-            f"the limits are {ends} {self.config.unit}",
+            f"the limits are {limits} {self.config.unit}",
             "Nothing was moved. Change the plan, or limits_deg in the rig file if they are wrong",
         )
 

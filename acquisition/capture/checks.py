@@ -16,7 +16,7 @@ from acquisition.rig.config import RigConfig
 from acquisition.rig.continuous_rotation import states_deg, turned, turns_to
 from acquisition.rig.rig import Rig
 from acquisition.rig.way import find_obstacle, find_way
-from drivers.axis_types import NO_LIMIT_DEG
+from drivers.axis_types import NO_LIMIT_DEG, Limits
 from drivers.errors import LimitError
 from processing.doors import one_line
 from processing.instrument.applied_effects import changes_at
@@ -104,11 +104,15 @@ def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) 
         if not np.all(np.abs(column) < NO_LIMIT_DEG):
             found = f"{column[np.argmin(np.abs(column) < NO_LIMIT_DEG)]:g} deg; no controller counts so far"
             return [CheckResult(f"angles of {axis}", False, found)]
-        low, high = rig.axes[axis].limits_deg or (None, None)
-        beyond = column[(column < (-np.inf if low is None else low)) | (column > (np.inf if high is None else high))]
-        if beyond.size:
-            ends = " to ".join("no limit" if end is None else f"{end:g}" for end in (low, high))
-            found = f"{beyond[0]:g} {rig.axes[axis].unit}; limits_deg of the rig file is {ends}. Change the plan"
+        # The limits of the open controller decide whether a folded target is inside.
+        ends, unit = rig.axes[axis].limits_deg, rig.axes[axis].unit
+        if ends is None or axis in rig.fold_deg:
+            continue
+        limits = Limits(*ends)
+        beyond = [target for target in column.tolist() if target not in limits]
+        if beyond:
+            allowed = f"the limits are {limits} {unit} (limits_deg of the rig file)"
+            found = f"{beyond[0]:g} {unit}; {allowed}. Change the plan"
             return [CheckResult(f"limits of {axis}", False, found + _could_fold(axis, rig))]
     checks = _free_ways(rig, states_deg(table))
     lacking = [axis for axis in instrument.axes if axis not in table.angles_deg]
@@ -215,7 +219,7 @@ def _check_park(rig: Rig) -> list[CheckResult]:
 
 
 def _could_fold(axis: str, rig: RigConfig) -> str:
-    if axis == ARM or axis in rig.fold_deg:
+    if axis == ARM or axis in rig.fold_deg or rig.axes[axis].unit != "deg":
         return ""
     return (
         f"; `fold_deg: {{{axis}: 180}}` there takes the same state half a turn away, as polarizers and retarders allow"

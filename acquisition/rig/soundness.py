@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from acquisition.rig.way import find_homing_obstacle, find_obstacle
-from drivers.motion import AxisConfig
+from drivers.axis_types import AxisConfig, Limits
 from processing.storage.captures.schema import NOT_AXES
 from processing.storage.formats.state_csv import NAME
 from simulators.rig.model import SCHEME
@@ -146,10 +146,9 @@ def _emulated_ports(rig: RigSections) -> Iterator[Mistake]:
 
 def _angles_outside_limits(rig: RigSections) -> Iterator[Mistake]:
     for where, name, angle in _given_angles(rig):
-        low, high = getattr(rig.axes.get(name), "limits_deg", None) or (None, None)
-        if (low is not None and angle < low) or (high is not None and angle > high):
-            ends = " to ".join("no limit" if end is None else f"{end:g}" for end in (low, high))
-            yield where, f"{angle:g} deg lies outside the limits of {name}, {ends} deg"
+        limits = Limits(*(getattr(rig.axes.get(name), "limits_deg", None) or (None, None)))
+        if angle not in limits:
+            yield where, f"{angle:g} deg lies outside the limits of {name}, {limits} deg"
 
 
 def _given_angles(rig: RigSections) -> Iterator[tuple[tuple[int | str, ...], str, float]]:
