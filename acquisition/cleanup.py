@@ -1,7 +1,5 @@
 """Cleanup that keeps going: every step runs, the first failure is reported and the others are attached to it."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable
 

@@ -4,8 +4,6 @@ Linux lets no process end, and hear no Ctrl-C, while one of its threads waits fo
 waits. The program that measures sends it one call at a time and can go on, shut the light and end without an answer.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import gc

@@ -1,7 +1,5 @@
 """What can stop a measurement, besides a device: the plan, the disc, the person at the bench."""
 
-from __future__ import annotations
-
 import traceback
 from pathlib import Path
 from typing import Any

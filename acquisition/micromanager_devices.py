@@ -11,8 +11,6 @@ A core counts in micrometres; here one of them is a degree. What a rig file forb
 through the rig. A move has ended when `setPosition` returns, and one that is refused or fails is its exception.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

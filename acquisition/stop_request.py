@@ -1,7 +1,5 @@
 """Ctrl-C and the stop button: once means finish the state, twice means stop now."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

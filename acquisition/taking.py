@@ -1,7 +1,5 @@
 """One capture from Python: plan and rig in, path of the sealed capture out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

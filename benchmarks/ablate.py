@@ -9,8 +9,6 @@ A line for each number and factor: the error of M of a sample that nobody diagno
 nothing has no reason to be one. Seeds below 1000 are for development.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json

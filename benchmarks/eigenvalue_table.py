@@ -5,8 +5,6 @@
 takes five minutes. `processing.polarization.sorted_eigenvalues` says what the table holds and in which units.
 """
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

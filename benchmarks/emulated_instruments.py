@@ -1,7 +1,5 @@
 """Every instrument of configs/ on an emulated bench: wrong by what its file does not say."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What honest error bars cost: xi0 and all quantities with first-order error bars alone, a table without any."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock

@@ -7,8 +7,6 @@ same functions as `process reduce`, `process quantities` and `process xi0`. Ever
 sample does not have (the azimuth of no diattenuation) is left out. Components are taken together.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Tasks on Mueller and mosaic images: inversion, eigenvalues, Lu-Chipman, demosaicing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -7,8 +7,6 @@ the emulated sample, or the ratio of the channels of measured data.
     python benchmarks/instrument_chain.py    prints the table of docs/studies/instrument-chain.md
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping

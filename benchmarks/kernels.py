@@ -5,8 +5,6 @@ Sums come out in another order on another processor: a verdict, a name or a sign
 engine.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

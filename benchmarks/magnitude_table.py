@@ -5,8 +5,6 @@
 takes five minutes. `processing.polarization.magnitude` says what the table holds and in which units.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.special import gammaincinv, ndtr
 

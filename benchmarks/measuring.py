@@ -1,7 +1,5 @@
 """How the benchmarks measure: ours and each peer in turns, medians, processor time, one format for every task."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

@@ -4,8 +4,6 @@
 What survives is listed by `--survivors`, and shown as a difference by `.venv/bin/python -m mutmut show NAME`.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import signal

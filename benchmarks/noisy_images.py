@@ -3,8 +3,6 @@
 The noise is drawn here, not by the project's detector model, and the capture is the RGB950's with 40 states.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -8,8 +8,6 @@ of the bench. What was taken already in the work folder is not taken again. `--q
 and one angle on a small camera.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import tempfile

@@ -1,7 +1,5 @@
 """The peers: their environment, made on first use, and their interpreter, one request at a time."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

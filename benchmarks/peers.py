@@ -3,8 +3,6 @@
 Reads one JSON line a task, {"task": name, "data": [files]}, runs it once, answers {"seconds": s} or {"error": text}.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """M of a plate from the ratio of two channels alone: a reference that shares no code with the project's fits."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares

@@ -8,8 +8,6 @@ diagnoses anew. Seeds below 1000 are for development; each other seed serves onc
 table of docs/studies/real-benches.md; `--figure` draws the reliability diagram.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,7 +1,5 @@
 """Tasks of `process reduce` and `diagnose` on captures: W of each pixel, weights, file to file, writing, start-up."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

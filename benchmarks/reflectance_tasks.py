@@ -1,7 +1,5 @@
 """Tasks on reflectance: xi0 from intensities, tables over scattering geometry, normals of a mesh."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

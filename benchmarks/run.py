@@ -8,8 +8,6 @@ compared, with a message. On a busy machine a target that the wall clock misses 
 is not judged.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import platform

@@ -4,8 +4,6 @@ A trigger that comes before the camera is armed is ignored (Lucid's `TriggerArme
 of `FrameTriggerWait`).
 """
 
-from __future__ import annotations
-
 from drivers.genicam import Features
 
 _ARMED = "TriggerArmed"

@@ -1,7 +1,5 @@
 """A number read over a line without checksum: readings have to agree before one is believed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from drivers.clock import REAL, Clock

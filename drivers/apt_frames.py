@@ -1,7 +1,5 @@
 """Frames of the Thorlabs APT protocol: little-endian, a header of six bytes, data behind some of them."""
 
-from __future__ import annotations
-
 import struct
 
 # A rack answers at RACK, the unit in its first bay at BAY, the next one behind that.

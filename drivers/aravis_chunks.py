@@ -4,8 +4,6 @@ The stamp that every frame carries is that of its transfer; what instant it mean
 the start of the frame. Tried on a simulated camera that sends chunks; on a real one unverified.
 """
 
-from __future__ import annotations
-
 import logging
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What arrives in Aravis' buffers, as counts: only where the camera announces the layout that was set."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

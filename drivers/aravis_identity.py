@@ -1,7 +1,5 @@
 """Which camera answered through Aravis, over which link, and how its pixels are laid out."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from drivers import genicam

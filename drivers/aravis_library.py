@@ -1,7 +1,5 @@
 """Getting at Aravis: the late import, which cameras answer, and the network interface a camera is reached by."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import ipaddress

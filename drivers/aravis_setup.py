@@ -1,7 +1,5 @@
 """Setting a camera up through Aravis, each part in the order that cameras need, and reading all of it back."""
 
-from __future__ import annotations
-
 import logging
 import re
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """A stream of frames from Aravis into memory of our own, pulled and never called back."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What an axis tells about itself and what a rig file tells about an axis."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

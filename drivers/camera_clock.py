@@ -6,8 +6,6 @@ until the two clocks are compared: the fastest delivery seen so far tells how fa
 been slower on its way than the host saw, nor faster than that.
 """
 
-from __future__ import annotations
-
 import logging
 
 log = logging.getLogger(__name__)

@@ -1,7 +1,5 @@
 """The clock that drivers count their deadlines and pauses by; it comes in with the ports, as real time by default."""
 
-from __future__ import annotations
-
 import time
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """Everything that can go wrong with a device, each error saying what was asked, what came back, what to do."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

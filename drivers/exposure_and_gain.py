@@ -6,8 +6,6 @@ where an exposure does not fit, and is not controlled otherwise. `Gain` is in de
 others.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from typing import Literal

@@ -1,7 +1,5 @@
 """A whole frame of a camera, and the mean of several."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Cameras accept values that they do not keep: on Aravis' own camera an exposure o
 as 3.57e9. So limits are checked before a value is written, and what is read back decides.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Literal, TypeVar

@@ -1,7 +1,5 @@
 """A log that a process of its own appends to its file: a disc that hangs or is full holds up nobody."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import stat

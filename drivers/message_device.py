@@ -5,8 +5,6 @@ kernel's own time limit says (``USBTMC_IOCTL_SET_TIMEOUT`` of ``linux/usb/tmc.h`
 pseudo-terminal of an emulator, is read when something is there.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

@@ -5,8 +5,6 @@ A program that has a core already (a notebook, a viewer) shares it with the driv
 type is its adapter's own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

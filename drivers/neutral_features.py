@@ -6,8 +6,6 @@ of the EPICS ADGenICam module: Allied Vision, Basler, FLIR, Point Grey, Adimec, 
 A rule is a pattern, so a name that is not in those lists is found where it is formed alike.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ makers have their own, of public code that uses them. In every code bits 16 to 2
 occupies. A format that is not listed here is refused: the layout would be a guess.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal

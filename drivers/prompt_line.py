@@ -1,8 +1,6 @@
 """Text protocol of Thorlabs' small boxes: a command ends in CR; most boxes echo it; all answer in lines that end in CR,
 and then send the prompt ">", which the SC10 and the FW102C follow with a blank."""
 
-from __future__ import annotations
-
 import re
 
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout

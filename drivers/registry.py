@@ -6,8 +6,6 @@ A kind is a module with a `Config` model, whose field `kind` is the kind's name,
 entry point `umov.axes`, `umov.cameras` or `umov.sources`, under the kind's name.
 """
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from functools import cache

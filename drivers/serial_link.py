@@ -1,7 +1,5 @@
 """Serial lines: one owner with one lock for each port, bounded waits, whole frames, a transcript on demand."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import io

@@ -1,7 +1,5 @@
 """Serial ports: opening one, who has it open, and ports that another process hands over."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

@@ -1,7 +1,5 @@
 """Axes whose controller cannot tell whether it is homed: the session remembers, and watches the resting position."""
 
-from __future__ import annotations
-
 from pydantic import Field
 
 from drivers.clock import REAL, Clock

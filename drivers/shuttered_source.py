@@ -1,7 +1,5 @@
 """A light source that may have an SC10 shutter beside it: filter wheels and tunable filters."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable
 from functools import partial

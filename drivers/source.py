@@ -1,7 +1,5 @@
 """A light source as the measurement sees it: on or off, its wavelength, and whether its interlock allows light."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 

@@ -5,8 +5,6 @@ begins with the letters of its question, and a command is answered with its lett
 nothing.
 """
 
-from __future__ import annotations
-
 import struct
 
 # Longer than any command: what the controller still waits for is filled up, and refused by its checksum.

@@ -1,7 +1,5 @@
 """A port whose controller takes lines of text and answers in lines, without saying what they answer."""
 
-from __future__ import annotations
-
 import re
 
 from drivers.serial_link import SerialLink

@@ -5,8 +5,6 @@ in 16 bits end at 65520. A digital gain below 1, or a full well, ends anywhere. 
 step that all of them have, and from a pile-up: pixels at one largest count, and hardly any just below it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Questions over lines whose replies do not tell which question they answer: order and form alone tell it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from typing import TypeVar

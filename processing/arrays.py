@@ -1,7 +1,5 @@
 """Types of arrays, under one name each."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

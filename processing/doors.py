@@ -5,8 +5,6 @@ arrays in `processing.storage`. A door looks at size, depth, types and shapes be
 and says in one line what is wrong.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """What effects of an instrument and of a reflectance share: a kind, parameters, and how their files are found."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import pkgutil

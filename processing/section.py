@@ -1,7 +1,5 @@
 """What a section of a file of ours is: fixed once read, without unknown keys."""
 
-from __future__ import annotations
-
 from pydantic import BaseModel, ConfigDict
 
 

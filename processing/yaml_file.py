@@ -1,7 +1,5 @@
 """Load a YAML file into a pydantic model, with errors that name the file, the line and the key."""
 
-from __future__ import annotations
-
 import functools
 import math
 import os

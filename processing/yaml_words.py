@@ -1,7 +1,5 @@
 """What is wrong with a value of a YAML file, in words that need no knowledge of the program."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from typing import Any

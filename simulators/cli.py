@@ -1,7 +1,5 @@
 """The `simulate` command: emulated controllers behind a pseudo-terminal, for any serial client."""
 
-from __future__ import annotations
-
 import signal
 import sys
 import threading

@@ -1,7 +1,5 @@
 """Time for simulators: real or patient, faster, or instant; and the trapezoid on which a motor moves."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

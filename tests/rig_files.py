@@ -1,7 +1,5 @@
 """Rig files for tests: the simulated rig, small and fast, and files with something changed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

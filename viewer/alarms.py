@@ -1,7 +1,5 @@
 """Alarms of the guard on every page, and the button that acknowledges one."""
 
-from __future__ import annotations
-
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse
 

@@ -1,7 +1,5 @@
 """The application: which address is answered by what."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from starlette.applications import Starlette

@@ -1,7 +1,5 @@
 """A campaign as people see it: a grid of its captures, when each was taken, and how long the rest will take."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections.abc import Iterator

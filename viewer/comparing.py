@@ -1,7 +1,5 @@
 """Two captures, or two products, side by side: their difference, and the difference over its error."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

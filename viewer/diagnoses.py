@@ -1,7 +1,5 @@
 """Diagnoses started from the page: where their files are, what they say, and what was decided about them."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re

@@ -1,7 +1,5 @@
 """What something looks like, sent to a page whenever it has changed (server-sent events)."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import AsyncIterator, Callable

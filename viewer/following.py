@@ -1,7 +1,5 @@
 """A run as it goes on: a stream of events for the page, and the stop button."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A capture: its frames as pictures, their histograms, and the table of its states."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

@@ -1,7 +1,5 @@
 """Who may come in: browsers on this machine that were given the address with its token, and no page of another site."""
 
-from __future__ import annotations
-
 import secrets
 
 from starlette.datastructures import Headers, MutableHeaders

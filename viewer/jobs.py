@@ -4,8 +4,6 @@ Every button runs a command that could be typed as well, and the page shows it. 
 hidden folder beside the data, so that every tab sees them, and a later start of the application too.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

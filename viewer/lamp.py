@@ -5,8 +5,6 @@ every state, and what is left over, in parts of the fit, is the lamp. States tha
 polarization, and tell the lamp without any model.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What lies in the folder: captures, products, tables and campaigns, and what was made from what."""
 
-from __future__ import annotations
-
 import json
 import os
 import threading

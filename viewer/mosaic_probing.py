@@ -1,7 +1,5 @@
 """A super-pixel of a polarization camera looked at closely: its analyzers in every state, one Stokes vector for all."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

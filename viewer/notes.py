@@ -1,7 +1,5 @@
 """Notes and tags of the files of a folder, which the page of each file changes and the lists show."""
 
-from __future__ import annotations
-
 import threading
 
 from pydantic import BaseModel, ConfigDict

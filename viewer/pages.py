@@ -1,7 +1,5 @@
 """What every page needs: the templates, the library, and where a file of the folder is shown."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

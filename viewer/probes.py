@@ -1,7 +1,5 @@
 """Answers to what a page asks of a pixel or a region."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A product: its maps with their standard errors and the valid mask, in the colours of print."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

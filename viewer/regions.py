@@ -1,7 +1,5 @@
 """Named regions of the images of a folder, and what an image says of each of them."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

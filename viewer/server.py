@@ -1,7 +1,5 @@
 """Serves the application on this machine alone."""
 
-from __future__ import annotations
-
 import resource
 import secrets
 import socket

@@ -1,7 +1,5 @@
 """Files that the application keeps beside the data, in the folder of its own: read and written as a whole."""
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError

@@ -1,7 +1,5 @@
 """A region followed through the products of a folder: over the arm angle, the wavelength, the time or the sample."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections import Counter

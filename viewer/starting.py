@@ -1,7 +1,5 @@
 """What a page starts: a campaign, a reduction, the maps of a product, a diagnosis; and how far each has come."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Callable
 from pathlib import Path

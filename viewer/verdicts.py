@@ -1,7 +1,5 @@
 """The page of a diagnosis: its verdict as a story, with linked maps and state plots, and the decision."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -12,8 +12,6 @@ bluesky knows a device by what it can do, so nothing of bluesky is imported here
 forbidden: every move goes through the rig, and so do limits, poses and interlocks.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager

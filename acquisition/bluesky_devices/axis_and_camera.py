@@ -1,7 +1,5 @@
 """An axis and the camera of a rig as bluesky devices."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A whole capture as a bluesky device, with what a pause leaves and where its frames are."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What axes, camera and captures have in common as bluesky devices."""
 
-from __future__ import annotations
-
 import threading
 import time
 from typing import Any

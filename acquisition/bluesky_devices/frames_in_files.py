@@ -1,7 +1,5 @@
 """Frames that stay in files, and the documents that point to them."""
 
-from __future__ import annotations
-
 import datetime
 import itertools
 import uuid

@@ -1,7 +1,5 @@
 """Settings that a plan can change, and signals that a suspender can watch, as bluesky devices."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What a campaign is taken with: the same rig, plans, instruments, devices and program in each of its runs."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from importlib.metadata import version

@@ -1,7 +1,5 @@
 """What a campaign leaves behind besides captures: a log in JSON lines, and an index of what was taken."""
 
-from __future__ import annotations
-
 import datetime
 import json
 import logging

@@ -1,7 +1,5 @@
 """Runs a campaign: everything checked before the first motion, each capture gone on with where it stopped."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What a night has brought, in a few lines: for the folder, the console and whoever is told."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence

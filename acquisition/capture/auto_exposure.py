@@ -1,7 +1,5 @@
 """Finds the exposure of a capture: the states that can be brightest are probed before the first is taken."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """Everything that can be known to be wrong before anything moves."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

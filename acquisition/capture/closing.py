@@ -1,7 +1,5 @@
 """The closing record of a capture, made of what its segments said at their ends."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How long a capture will take, from distances, speeds and exposures."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from acquisition.capture.job import Job

@@ -1,7 +1,5 @@
 """What a frame says of itself, and against the camera, the lamp and the shutter, as it comes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A file name for a new capture that nobody else gets, should several begin in the same second."""
 
-from __future__ import annotations
-
 import itertools
 import os
 from collections.abc import Iterator

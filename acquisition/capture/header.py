@@ -1,7 +1,5 @@
 """What a capture says about itself before its first state: header, title, file name."""
 
-from __future__ import annotations
-
 import datetime
 import json
 import platform

@@ -4,8 +4,6 @@ Plan, rig, instrument, devices and program are the same in all parts of a captur
 plugged in, and how far its counters are.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

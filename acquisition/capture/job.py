@@ -1,7 +1,5 @@
 """A capture as a job: plan, rig, instrument and states that belong together and have been checked."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -4,8 +4,6 @@ An error of the disc inside HDF5 can bring the interpreter down, or be passed ov
 neither now nor later, for which the place of the status is noted in the file.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

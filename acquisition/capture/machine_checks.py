@@ -3,8 +3,6 @@
 The rig file is sound without them, and can be read, resumed from and stopped by on another machine; no run begins.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a run says in words, for its closing record."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Which analyzer stands before the first pixel of a frame: the region's place on a polarization sensor decides."""
 
-from __future__ import annotations
-
 from acquisition.errors import AcquisitionError
 from drivers.camera import Camera, CameraIdentity, CameraSettings
 from processing.instrument.model import InstrumentModel

@@ -1,7 +1,5 @@
 """The person at the bench: changes the sample, the filter or the camera when asked to."""
 
-from __future__ import annotations
-
 import select
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What a run writes about itself: the begin and the end of its segment."""
 
-from __future__ import annotations
-
 import getpass
 import os
 import socket

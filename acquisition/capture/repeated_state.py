@@ -5,8 +5,6 @@ all. Where a plan comes back to its first pose (`repeat_first`), the two frames 
 not what: `diagnose` tells a slipped element from a lamp that drifts.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

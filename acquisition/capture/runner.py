@@ -4,8 +4,6 @@ The next move starts as soon as the light of a state has been collected; its fra
 written, while the axes turn. A frame that did not arrive whole puts its state back into the queue.
 """
 
-from __future__ import annotations
-
 import logging
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence

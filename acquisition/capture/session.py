@@ -1,7 +1,5 @@
 """One capture from job to sealed file: home, go to the pose, take the states, seal, whatever happens."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -5,8 +5,6 @@ syncs: HDF5 has no part in it, so it cannot leave its own structures half writte
 its lock nor Python's.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

@@ -1,7 +1,5 @@
 """Names and folders that a power cut does not take."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

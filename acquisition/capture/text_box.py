@@ -5,8 +5,6 @@ that is larger than the text is as good to every reader (HDF5 File Format Specif
 1 Data Object Header Prefix", IV.A.2.d, "Datatype Message", and IV.A.2.i, "Data Layout Message").
 """
 
-from __future__ import annotations
-
 import os
 import struct
 

@@ -1,7 +1,5 @@
 """Where the time of a capture went: moving, settling, exposing, waiting for what is unavoidable, or overhead."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Literal

@@ -4,8 +4,6 @@ Deadlines count on clocks that nobody can set. The time of day is only for the r
 start of the run, as if nobody had set the clock: the order and the distances in time of the states stay right.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 

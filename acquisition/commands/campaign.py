@@ -1,7 +1,5 @@
 """`acquire --campaign FILE`: check the whole of it, then run what is missing."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shlex

@@ -1,7 +1,5 @@
 """`acquire verify`, `repair` and `compress`: what a folder of captures holds, what is damaged and what half done."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What the commands of `acquire` share: files that come with the program, the rig option, the exit code of a stop."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """`acquire doctor`: what is there, what is not and why. Moves nothing, changes no light."""
 
-from __future__ import annotations
-
 import importlib
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """`acquire init`: a rig file to begin with, made of the cameras and serial ports that are there. Opens no port."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The `data` command: public measured data by name, and the captures that they make."""
 
-from __future__ import annotations
-
 import os
 import shlex
 from collections.abc import Sequence

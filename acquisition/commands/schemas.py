@@ -3,8 +3,6 @@
 `python -m acquisition.commands.schemas` writes them; a test fails while the committed ones are stale.
 """
 
-from __future__ import annotations
-
 import json
 from functools import reduce
 from operator import or_

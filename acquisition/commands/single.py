@@ -1,7 +1,5 @@
 """`acquire --omega 35` and `acquire --resume FILE`: one capture, from the options to the summary."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shlex

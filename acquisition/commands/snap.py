@@ -1,7 +1,5 @@
 """One frame as things stand, for focusing and finding the sample."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """The loop by the product's own steps: take, reduce, diagnose, write the corrected instrument, reduce again."""
 
-from __future__ import annotations
-
 import hashlib
 import shlex
 import time

@@ -1,7 +1,5 @@
 """The result of the demo in words: built-in faults with what was found, and the figures before and after."""
 
-from __future__ import annotations
-
 from acquisition.demo.loop import Demo
 from processing.diagnosis.search.result import FoundEffect
 

@@ -1,7 +1,5 @@
 """What the simulated rig truly has: drawn faults, and the Mueller image and xi0 that a product is compared with."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

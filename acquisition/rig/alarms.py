@@ -1,7 +1,5 @@
 """Alarms that repeat until somebody acknowledges them; each is a small file in memory, so that any program sees it."""
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import errno

@@ -1,7 +1,5 @@
 """The rig file: which devices, at which ports, which poses are forbidden, what the simulator stands in for."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rotators that may go on to the next turn instead of unwinding between captures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Targets outside an axis's travel, moved into it by whole half turns or turns, which its element does not notice."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

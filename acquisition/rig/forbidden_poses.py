@@ -1,7 +1,5 @@
 """Poses that the rig must neither stand in nor pass on the way. Every angle counts modulo a turn."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 

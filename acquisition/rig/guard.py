@@ -8,8 +8,6 @@ The guard acts in a fixed order: light, axes, words. It opens no file on the dis
 through a pipe to a process of its own, which may hang.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """What `acquire` does for its guard (acquisition/rig/guard.py): no light without a guard that watches."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

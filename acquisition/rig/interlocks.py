@@ -1,7 +1,5 @@
 """Conditions under which a state counts; when one opens, the state is thrown away and the axes are held."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

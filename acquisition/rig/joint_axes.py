@@ -1,7 +1,5 @@
 """The axes of a rig as one: they move at the same time, by ways that are allowed, and stop together."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from acquisition.cleanup import run_all

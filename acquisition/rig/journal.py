@@ -1,7 +1,5 @@
 """The journal of the guard: lines of JSON that a process of its own writes."""
 
-from __future__ import annotations
-
 import datetime
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Opens the rig of a rig file: real devices, or emulators with a bench behind them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

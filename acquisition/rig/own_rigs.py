@@ -3,8 +3,6 @@
 A data file may come from somebody else. Devices, commands and paths are taken from these rig files, never from it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

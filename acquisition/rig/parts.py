@@ -1,7 +1,5 @@
 """The sections of a rig file besides its devices."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal, Self
 

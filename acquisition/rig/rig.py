@@ -1,7 +1,5 @@
 """The open rig: the only holder of live hardware. Opening it moves nothing and changes no light."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import threading

@@ -5,8 +5,6 @@ on +z. A solid that turns with an axis is given as it stands at that axis's angl
 through the origin, from +z towards +x, as the arm does.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field

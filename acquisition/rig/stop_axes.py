@@ -6,8 +6,6 @@ second and keeps its partial file. Once it has let go of the ports, the stop is 
 watched until they rest. Other programs are named and left alone: what they do with a signal is not known.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """Small pictures for the live page, made when a browser asks for them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

@@ -4,8 +4,6 @@ It takes no time from the measurement: it runs only when nothing else wants to, 
 draws a picture once however many ask for it. Nothing is given without the token.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -5,8 +5,6 @@ not fit, and the last frame into memory that both processes see, if the page is 
 else, and every browser, is the concern of the other process (`live_process`), which runs when nothing else wants to.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import mmap

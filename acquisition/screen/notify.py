@@ -1,7 +1,5 @@
 """Tells somebody how a run ended, that it failed, or that an interlock holds it: by a command, a webhook, or both."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -1,7 +1,5 @@
 """Who watches a run: progress bar, live page, campaign log, and the simulated bench."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What the console shows while a capture runs: state, angles, time left; plain lines where it is no terminal."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The figure at the end of a capture: does it look as it should, before anybody reduces it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

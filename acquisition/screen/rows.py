@@ -1,7 +1,5 @@
 """Rows of a few words each: aligned and coloured on a terminal, without padding in a file or a pipe."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 from rich.console import Console

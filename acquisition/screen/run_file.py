@@ -4,8 +4,6 @@ Who looks from elsewhere sees where the run is, and may send its process what Ct
 the file a few times a second: a slow or full disc keeps nobody from measuring.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

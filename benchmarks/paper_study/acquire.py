@@ -1,7 +1,5 @@
 """The captures of the study: campaigns on the emulated rig, taken by `acquire` itself."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ other one is by how much the square of the deviation falls when its cause is tak
 in place of the file's, the bench's own material in place of Table I, which only a simulation knows.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

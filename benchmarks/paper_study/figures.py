@@ -1,7 +1,5 @@
 """The figures of the paper, from the study's products, in the paper's order."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The study as one page: the paper's numbers beside ours, figure by figure."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version

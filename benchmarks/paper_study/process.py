@@ -1,7 +1,5 @@
 """What the study makes of its captures, with the same steps as the commands of `process` and `diagnose`."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Mapping

@@ -8,8 +8,6 @@ relied on: they go missing on real units (PnPQ#104). The units in the bays of a 
 Unverified on hardware: everything of the KBD101, the KST101 and the racks.
 """
 
-from __future__ import annotations
-
 import logging
 import struct
 from dataclasses import dataclass

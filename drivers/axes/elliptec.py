@@ -6,8 +6,6 @@ was ever homed. Assumed, not read: 430 deg/s at full velocity (vendor's specific
 deadlines only.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from collections import Counter

@@ -5,8 +5,6 @@ neither address nor command, so only their order and their form tell whose they 
 whether an axis is homed. Use RS-232: USB is reported unusable on Linux.
 """
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from typing import ClassVar, Literal

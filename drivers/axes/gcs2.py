@@ -6,8 +6,6 @@ controller answers on a line: a daisy chain is not supported. The axis's unit mu
 Unverified on hardware: everything; that `FRF` wants the servo on, and that limits of a stage without any are huge.
 """
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from typing import Literal

@@ -7,8 +7,6 @@ while one of its axes moves: one axis of it can be in a rig. Other SHOT controll
 Unverified on hardware: everything; that a GSC-01 keeps the result of a command until the next.
 """
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from typing import ClassVar, Literal, NamedTuple

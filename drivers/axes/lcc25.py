@@ -10,8 +10,6 @@ found. The controller does not see the crystal: `settle_s` is the time that it t
 Unverified on hardware: everything; form of the answers to `mode?` and `enable?` (public drivers: a number).
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

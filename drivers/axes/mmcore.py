@@ -6,8 +6,6 @@ adapter that holds its device's lock while it moves. The guard beside a run has 
 stage only if `configuration` can be loaded twice. Tried with stages written in Python and with the stage of DemoCamera.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 

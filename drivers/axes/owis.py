@@ -8,8 +8,6 @@ session remembers. Speed and limits have units that are not documented either: t
 Unverified on hardware: everything.
 """
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from typing import ClassVar, Literal

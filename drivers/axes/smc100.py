@@ -5,8 +5,6 @@ not the name of a command. Unverified on hardware: `ID?` (stage identifier) on e
 PR50CC as a member of it.
 """
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from typing import ClassVar, Literal

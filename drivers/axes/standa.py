@@ -8,8 +8,6 @@ their encoder, whose speeds have another unit.
 Unverified on hardware: everything; that `home` after `sstp` starts anew in the status, and what `zero` does to borders.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import partial

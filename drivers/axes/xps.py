@@ -9,8 +9,6 @@ Unverified on hardware: everything; that no Login is asked; the text behind an e
 compare is refused. The unit must be degrees, which is not asked.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 from functools import partial

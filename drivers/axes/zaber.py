@@ -5,8 +5,6 @@ Unverified on hardware: the unit of speed and acceleration, which word goes with
 position does not wrap at a turn.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ There are no time stamps and no numbers of frames. Gain, black level and trigger
 they are `properties`. Tried with a camera written in Python and with DemoCamera.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from contextlib import AbstractContextManager

@@ -9,8 +9,6 @@ and two for the CS260. Gratings, filters and slits stay as they are set. Unverif
 query waits for the end of a move.
 """
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from typing import Literal

@@ -9,8 +9,6 @@ their queries), the manual of 2020, page 43 (error query, LED head). Unverified:
 word that `MODe?` answers, and USBTMC as a whole, which no emulator here speaks.
 """
 
-from __future__ import annotations
-
 import re
 from typing import Annotated, Literal, Self
 

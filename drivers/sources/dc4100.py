@@ -10,8 +10,6 @@ three other projects agree on them. Status bits: DC4100 manual, rev. 2.2 of 2022
 box: the exact text of `E?`, and the number format of `BP?`, which the adapter reads as a floating point number.
 """
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from typing import Annotated, Literal, Self

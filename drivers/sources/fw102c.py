@@ -8,8 +8,6 @@ comments show echo, answer and prompt; python-microscopy). Unverified: text of `
 blocked answers.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator

@@ -7,8 +7,6 @@ watchdog has run out the outputs stand at their safe value, which is off as deli
 answered with ``!`` and ignored.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Literal
 

@@ -8,8 +8,6 @@ Sources: user guide of the KURIOS-VB1, rev. G of 2019, pages 17 to 22 (baud rate
 the number of ``OM=1`` (manual), which is that of a public program.
 """
 
-from __future__ import annotations
-
 import re
 from typing import Literal
 

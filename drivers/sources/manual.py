@@ -1,7 +1,5 @@
 """A light source without a cable: the operator switches it when asked to."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Literal
 

@@ -5,8 +5,6 @@ reads the blade, `interlock?` is 1 while the interlock circuit is open (Thorlabs
 12 and 13; not yet tried on the real box).
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """A copy of an instrument file with fitted values and their standard uncertainties put in; comments stay."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from io import StringIO
 from pathlib import Path

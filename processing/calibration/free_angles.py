@@ -6,8 +6,6 @@ inverse of the summed information; its gradient by an angle follows from the row
 states at once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Which illumination a linear Stokes capture should have, by the standard error of xi0 that it predicts."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ The sample is known up to one throughput for each pixel, so the throughput is el
 parameters it has its least-squares value (variable projection).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ linear Stokes vector, I = a . S, is measured with known polarization; a frame is
 pixels would have seen.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -4,8 +4,6 @@ Two frames of one scene differ by noise alone. Half the variance of their differ
 line variance = slope * signal + floor (EMVA 1288, "photon transfer"). The line gives gain and read noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What undeclared errors of a bench do to the Mueller matrix that a table of states gives."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

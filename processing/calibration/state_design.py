@@ -5,8 +5,6 @@ variances of the 16 elements for unit noise. It is least where s covers the sphe
 then W^T W = N/16 D (x) D with D = diag(1, 1/3, 1/3, 1/3), and the variance 1600 / N (40 for 40 states).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

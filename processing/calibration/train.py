@@ -4,8 +4,6 @@ Captures at several wavelengths are fitted at once: what a mount does is the sam
 not, or follows a smooth curve.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product

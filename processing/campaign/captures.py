@@ -1,7 +1,5 @@
 """The captures of a campaign's folder: which of them are of an object, and which of these are compared."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple

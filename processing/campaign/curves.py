@@ -1,7 +1,5 @@
 """A campaign of any samples without a geometry: every capture reduced, and the means of a region of each."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass

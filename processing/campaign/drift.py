@@ -1,7 +1,5 @@
 """How an instrument changed between two captures of one sample, and the table of all checks since."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping
 from dataclasses import dataclass

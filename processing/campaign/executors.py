@@ -1,7 +1,5 @@
 """Where independent tasks run: here, in worker processes, or on a dask.distributed cluster. One interface."""
 
-from __future__ import annotations
-
 import importlib
 import os
 from collections.abc import Callable, Iterator, Sequence

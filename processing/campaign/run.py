@@ -5,8 +5,6 @@ the model at the same pixels; xi0 of both instruments goes into tables over scat
 on a virtual sphere as the Stokes camera sees it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace

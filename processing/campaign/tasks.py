@@ -1,7 +1,5 @@
 """What a campaign does with one capture, as a function that can run in another process or on another machine."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

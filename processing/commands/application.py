@@ -1,7 +1,5 @@
 """The `process` command: everything from a capture file onwards."""
 
-from __future__ import annotations
-
 import pkgutil
 from collections.abc import Sequence
 from importlib import import_module

@@ -1,7 +1,5 @@
 """`process from-axostep` and `to-axostep`: Mueller images of RGB950's own program, in and out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

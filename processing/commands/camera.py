@@ -1,7 +1,5 @@
 """`process camera`: gain, read noise, black level and bad pixels of a camera."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """What the five commands share: their look, `--version`, and errors of the user as one message, never a traceback."""
 
-from __future__ import annotations
-
 import atexit
 import gc
 import os

@@ -1,7 +1,5 @@
 """The figure that a command leaves beside its product."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

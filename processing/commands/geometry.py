@@ -1,7 +1,5 @@
 """`process camera-pose` and `process register`: where the camera and the object are."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

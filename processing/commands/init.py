@@ -1,7 +1,5 @@
 """`process init`: ten questions, and an instrument file with comments from the answers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Options of the commands that write a product."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

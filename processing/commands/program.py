@@ -1,7 +1,5 @@
 """The program `umov`: all commands under one name, `umov acquire`, `umov process reduce`, ..."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Sequence

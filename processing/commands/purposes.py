@@ -1,7 +1,5 @@
 """Headings of `process --help`: what its commands are for, in the order of the work."""
 
-from __future__ import annotations
-
 DATA = "Bring data in"
 IMAGES = "Images and quantities"
 CALIBRATION = "Calibrate and design"

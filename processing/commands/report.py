@@ -1,7 +1,5 @@
 """`process report`: one self-contained HTML about a measurement."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

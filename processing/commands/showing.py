@@ -1,7 +1,5 @@
 """`process show`: what the values of an instrument file do."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """What a command prints about its product."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

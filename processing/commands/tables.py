@@ -1,7 +1,5 @@
 """`process table`: tables over scattering geometry, their comparison, and the renderer's file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

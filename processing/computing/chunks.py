@@ -4,8 +4,6 @@ Each further type or layout of a big loop costs seconds of compilation, so only 
 They are compiled at all because numpy's converting copies cost as much as the arithmetic in between.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

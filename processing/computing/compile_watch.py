@@ -1,7 +1,5 @@
 """Who wants to know that loops are being compiled. Apart from `computing.compiling`, which takes long to import."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 #: Each is called, without arguments, whenever a compilation begins.

@@ -3,8 +3,6 @@
 Compiled code is kept beside the source; only a fresh installation, or a change of the processor, compiles again.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from numba import njit

@@ -4,8 +4,6 @@ The loops release the interpreter lock, so threads are enough: they work inside 
 calls us, where an OpenMP pool would not survive a fork and numba's own pool refuses two callers at once.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

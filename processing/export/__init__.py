@@ -4,8 +4,6 @@ Captures and products start from the labelled arrays of `processing.labelled`: s
 and checksums are verified. Each file says what its numbers are, in which unit, and whether they are simulated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Columns as comma-separated text that reads back to the same numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

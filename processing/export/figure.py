@@ -1,7 +1,5 @@
 """Figures of products for a paper."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Means with their uncertainties as CSV, or as JSON with the budget of each."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """A scattering table as text: a row for each bin that has samples."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

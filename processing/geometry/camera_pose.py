@@ -1,7 +1,5 @@
 """Calibrate the camera with images of a ChArUco board (OpenCV): `process camera-pose`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A flat sample, turned about the vertical axis of the centre of rotation."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The compiled loop of meshes: where a ray meets its triangle, and the normal there."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.computing.compiling import njit

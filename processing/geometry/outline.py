@@ -1,7 +1,5 @@
 """Find a sphere in an image by its outline: centre and radius in pixels, with standard errors."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

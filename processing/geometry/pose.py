@@ -1,7 +1,5 @@
 """Refine the pose of a mesh so that its silhouette meets the object's outline in an image."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """Rusinkiewicz angles of a scattering geometry (Jarecki and Kupinski, Sec. III-A; docs/conventions.md, "Frames")."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A sphere in front of a pinhole camera: which pixels see it, and the normal there."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

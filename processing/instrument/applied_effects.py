@@ -1,7 +1,5 @@
 """The effects that an instrument file names: what they change in the forward model of one capture."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 

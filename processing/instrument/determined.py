@@ -1,7 +1,5 @@
 """What an instrument can determine of a Mueller matrix: all 16 elements, or fewer for a partial polarimeter."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.arrays import Array, BoolArray

@@ -1,7 +1,5 @@
 """Optical elements of an instrument: polarizers, retarders, diattenuators, fixed or turned by a named axis."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Literal, Self
 

@@ -4,8 +4,6 @@ There are many uncertain directions. A file has their values by effect and no mo
 correction are, those of three captures took a file as long as none is read.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal

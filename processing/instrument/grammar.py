@@ -5,8 +5,6 @@ written here by rule, so that a fault without a name can be found, corrected and
 axis of an element or that of an element before it: light does not go back.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 

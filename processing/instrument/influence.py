@@ -1,7 +1,5 @@
 """What each value that `diagnose` wrote into an instrument file does to a Mueller matrix."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

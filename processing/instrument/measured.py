@@ -1,7 +1,5 @@
 """A measurement matrix W that was measured as a whole, as the states of an instrument."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any, Self
 

@@ -1,7 +1,5 @@
 """Values of the train that an instrument file calls nominal (`calibrate`): which exist, and a shift of one of them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.instrument.changes import Changes

@@ -1,7 +1,5 @@
 """Standard uncertainties that an instrument file states: `{value: ..., u: ...}`, and how they are correlated."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Self
 

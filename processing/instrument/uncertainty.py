@@ -1,7 +1,5 @@
 """Standard uncertainties that an instrument file states of its values, as independent directions of one each."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ A Mueller matrix is a sum of four Mueller-Jones matrices, M = m00 (xi0 m0 + xi1 
 the eigenvalues of its coherency matrix divided by its trace (paper, Sec. II; docs/conventions.md, "Coherency matrix").
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -4,8 +4,6 @@ The layout of a tile is described there. Rows of a tile are passed as slices, so
 and vectorizes along pixels.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -9,8 +9,6 @@ A tile holds the traceless coherency matrix A = H / tr H - 1/4, scaled to tr A^2
 precision for strong depolarizers, where H is close to 1/4.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ Every function takes Mueller matrices (..., 4, 4) in float64 and returns `Derive
 components stack on the left. Angles are in degrees here, as products hold them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

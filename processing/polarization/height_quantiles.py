@@ -8,8 +8,6 @@ are drawn evenly from all Mueller-Jones matrices. All numbers are in units of th
 matrix, root mean square over all directions, so that one table serves every pixel of an instrument.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How far two polarization images differ: orientation, magnitude, xi0 (Jarecki and Kupinski, Secs. V-A, V-B)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

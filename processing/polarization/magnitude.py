@@ -9,8 +9,6 @@ Units: u^2 = tr C^2 / tr C, C being the covariance of the vector. In them the no
 components, and at most sqrt(components) is the variance along the vector; for n components alike these are n and 1.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple

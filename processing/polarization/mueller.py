@@ -5,8 +5,6 @@ into the beam, Pauli order s0 = 1, s1 = diag(1, -1), s2 = [[0, 1], [1, 0]], s3 =
 Angles are in radians here; every function broadcasts over leading axes and returns (..., 4, 4).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

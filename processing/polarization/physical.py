@@ -4,8 +4,6 @@ Noise makes a measured matrix of a weakly depolarizing sample unphysical. These 
 never in its place: they are biased where the truth is near the border.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

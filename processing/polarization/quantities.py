@@ -4,8 +4,6 @@ Functions of Mueller matrices (..., 4, 4) return one number a matrix; angles are
 their derivatives, `decompositions` and `cloude` the decompositions.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -5,8 +5,6 @@ what the map is called. Optional: `gradient(m)` (..., 16), else differences are 
 (row-major, m00 is 0) of the elements that are the vector whose length it is.
 """
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 Q. Jarecki and M. Kupinski, *Efficient Modeling of Depolarizing Mueller BRDFs*, Eq. 1.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

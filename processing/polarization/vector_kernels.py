@@ -1,7 +1,5 @@
 """Compiled loops over pixels behind `vector_noise`, `magnitude` and `sorted_eigenvalues`."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.computing.compiling import njit

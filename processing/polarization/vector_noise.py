@@ -1,7 +1,5 @@
 """Noise of vectors that a Mueller matrix gives, from the covariance of its 16 elements."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 

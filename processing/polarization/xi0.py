@@ -6,8 +6,6 @@ Jarecki and Kupinski (Sec. IV; docs/conventions.md). Nothing is clipped: a value
 model m0 and is flagged. Standard errors hold the noise of the intensities, not errors of m0.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From the files of a public set to captures: the table of states of each, as `process import` reads it."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence

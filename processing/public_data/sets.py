@@ -1,7 +1,5 @@
 """The catalogue of public measured data, and their files: from a folder of one's own, or from the network."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """States whose counts are cut off at zero: an offset pushed the dark part of the image below what the camera tells."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """What an instrument file's effects (found by `diagnose`) mean for one capture that is about to be reduced."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from copy import copy
 from dataclasses import dataclass, field

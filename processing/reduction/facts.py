@@ -1,7 +1,5 @@
 """What a reduction reports: numbers for the summary, and warnings that a user should act on."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

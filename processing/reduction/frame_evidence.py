@@ -5,8 +5,6 @@ of a rotation is linear in the sixteen elements of the mean Mueller matrix, and 
 that the others contradict by one factor, or that agrees with them once it is mirrored, has a cause outside the plan.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The instrument model that a capture is reduced with, and whether its frames can be that instrument's."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from processing.instrument.model import InstrumentModel

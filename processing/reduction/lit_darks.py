@@ -3,8 +3,6 @@
 Subtracted, such frames leave nothing, and nothing else shows it: every file is well formed and every state whole.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The measurement matrix W of a capture: from the angles read back, scaled with the exposure."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Images moved by fractions of a pixel, by interpolation with a spline of fifth order, and without a slight blur."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -3,8 +3,6 @@
 Row blocks keep memory constant; the product can be resumed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path

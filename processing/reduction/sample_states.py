@@ -1,7 +1,5 @@
 """The states of a capture that look at its sample."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

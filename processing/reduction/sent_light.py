@@ -4,8 +4,6 @@ Every row of W is kron(a, g) with the same g, so intensities are a . (M g): the 
 for this light. For unpolarized light it is the first column of M, and elements are determined after all.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Self
 

@@ -1,7 +1,5 @@
 """Reduce the frames of a polarization mosaic to a linear Stokes image: S0, S1, S2, DoLP, AoLP with standard errors."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

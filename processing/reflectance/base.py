@@ -1,7 +1,5 @@
 """What every reflectance model offers, and how a file names one: its `kind` is a module of this folder."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from functools import cache

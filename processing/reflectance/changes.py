@@ -1,7 +1,5 @@
 """What effects change in Jarecki and Kupinski's model of the dominant process, for a set of scattering geometries."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 Jarecki and Kupinski, Sec. III-B.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

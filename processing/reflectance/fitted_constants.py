@@ -1,7 +1,5 @@
 """Fitted constants of a material: their ranges, least squares, errors, and what the data do not determine."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Fresnel reflection: amplitudes, and the Jones matrix of a microfacet in the instrument frames."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

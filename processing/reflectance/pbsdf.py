@@ -6,8 +6,6 @@ the cosine of the angle of incidence is divided out. Each matrix refers to the a
 the surface are NaN there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal

@@ -4,8 +4,6 @@ Least squares on the values of each pixel, divided by the noise. The brightness 
 light may be uneven, and no white reference is necessary.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 

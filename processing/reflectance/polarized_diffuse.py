@@ -1,7 +1,5 @@
 """First surface plus polarized diffuse reflection, added as Jones matrices (Jarecki and Kupinski, III-B to D)."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

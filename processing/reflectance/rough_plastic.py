@@ -4,8 +4,6 @@ Light is reflected by microfacets (GGX, Smith's shadowing), or refracted into th
 transmittances of the smooth surface. Baek et al., ACM Trans. Graph. 37, 268 (2018); Walter et al., EGSR 2007.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

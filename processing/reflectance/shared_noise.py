@@ -1,7 +1,5 @@
 """Variance of a bin's mean where the noise of neighbouring pixels is correlated, as demosaicing makes it."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

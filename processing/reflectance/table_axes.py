@@ -1,7 +1,5 @@
 """Bins of a table over (theta_h, theta_d, phi_d): 91 x 91 x 361, in one of two layouts (docs/conventions.md)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Loops over the samples of a table: which are known, in which row each is, and the sums of each row."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """What a capture is, in words: for its section of a report and for its page in the browser."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.storage.captures.capture import Capture

@@ -4,8 +4,6 @@ Signed quantities diverge about zero, red for positive and blue for negative eve
 light is grey; standard errors have colours of their own, so that nobody takes one for the other.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Figure of the checks of an instrument over time."""
 
-from __future__ import annotations
-
 from datetime import datetime
 from pathlib import Path
 

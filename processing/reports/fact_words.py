@@ -1,7 +1,5 @@
 """A fact of a product in words, the same on the console, in reports and in the browser."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Collect captures, products, curves and pictures of a measurement into one report."""
 
-from __future__ import annotations
-
 import csv
 import os
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Report section of a table over scattering geometry."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A report as one HTML file: text, tables and figures inside, nothing fetched from anywhere."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,12 +1,11 @@
 """A step whose product is one file, which is found again by what it was made of, never by its name or time stamp."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
-from typing import NamedTuple
+from types import UnionType
+from typing import NamedTuple, get_args, get_origin
 
 from processing.computing.blas import one_blas_thread
 from processing.doors import require_place
@@ -30,9 +29,10 @@ class OfFiles:
     def __post_init__(self) -> None:
         for entry in fields(self):  # type: ignore[arg-type]  # its subclasses are dataclasses
             value = getattr(self, entry.name)
-            if "tuple[Path" in str(entry.type) and value is not None:
+            forms = get_args(entry.type) if isinstance(entry.type, UnionType) else (entry.type,)
+            if value is not None and any(get_origin(form) is tuple and Path in get_args(form) for form in forms):
                 value = tuple(map(Path, [value] if isinstance(value, str | Path) else value))
-            elif "Path" in str(entry.type) and value is not None:
+            elif value is not None and Path in forms:
                 value = Path(value)
             object.__setattr__(self, entry.name, value)
 

@@ -1,7 +1,5 @@
 """Maps of a reduced image: derived quantities, xi0, and the Mueller image that a model extrapolates."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Products to a material file."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A capture to its Mueller or Stokes image."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Products to a table over scattering geometry."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

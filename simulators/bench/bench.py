@@ -5,8 +5,6 @@ well, read noise, gain, black level and digitizing. Random numbers come from (se
 the same plan and seed give the same frames byte for byte, unless an effect changes with time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 

@@ -3,8 +3,6 @@
 These are statements about an invented surface, not results: Jarecki and Kupinski give no law for xi0 or M00.
 """
 
-from __future__ import annotations
-
 from typing import Self
 
 import numpy as np

@@ -5,8 +5,6 @@ not what was simulated: boundary conditions for the tangential field in place of
 the axes p, vectors in place of phi_d, and a Mueller matrix put together from the Stokes vectors of four beams.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -4,8 +4,6 @@
 no fault of the simulated rig produces is not in the table.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any

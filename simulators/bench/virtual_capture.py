@@ -1,7 +1,5 @@
 """A whole capture file straight from the simulated bench, without drivers or motors: for virtual experiments."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 from pathlib import Path
 

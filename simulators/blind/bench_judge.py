@@ -1,7 +1,5 @@
 """What `diagnose` made of a real bench against its truth: the Mueller matrix of another sample, and the names."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

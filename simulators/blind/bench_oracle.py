@@ -4,8 +4,6 @@ The fit is that of `diagnose`, with the distribution that the sizes were drawn f
 not determine stays as small as it is on a bench of this suite.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Diagnose one bench of `real_bench`, apply what was written to captures that no fit saw, and judge it."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Figures over many benches: how good M is, how often its intervals hold, how often a name is right."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -4,8 +4,6 @@
 wrong.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.arrays import Array

@@ -5,8 +5,6 @@ two numbers, with a random sign where the fault has one. docs/studies/real-bench
 their reasons. `weight` is the relative chance that a bench has the fault at all.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Faults that only a polarization camera can have: of its channels, and of neighbouring pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.arrays import Array

@@ -3,8 +3,6 @@
 The first nine are in `undeclared_faults.UNLISTED`. Each changes a TrueBench and says what it did.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 

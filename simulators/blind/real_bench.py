@@ -8,8 +8,6 @@ Other groups have one thing wrong on such a bench, or nothing: `GROUPS`. Seeds b
 from 1000 on for one reported run each.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field

@@ -1,7 +1,5 @@
 """Reliability diagram: of causes that were told with a probability, how many are true."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Each takes the scene (or the optics) that the processing believes in and returns the true one.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

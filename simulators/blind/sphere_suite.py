@@ -1,7 +1,5 @@
 """Captures of a sphere with one thing wrong that the processing is not told: for tests and for the blind suite."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -5,8 +5,6 @@ as Jones matrices (coherency of the generator's output, Hermitian form of the an
 of position that is looked up where the ray lands, counts come from Poisson electrons and a real transfer curve.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -4,8 +4,6 @@
 is (kind, place, parameters in the units of the effect): only what can be compared number by number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol

@@ -4,8 +4,6 @@ Each changes what the capture file says or how the bench is put together, and it
 that mends it. Sizes that a calibration could find are in `lab_priors`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

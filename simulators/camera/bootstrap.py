@@ -1,7 +1,5 @@
 """Registers that every GigE Vision camera has at the same addresses: who it is, what it can, where its XML stands."""
 
-from __future__ import annotations
-
 import socket
 import struct
 

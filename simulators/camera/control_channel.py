@@ -3,8 +3,6 @@
 Numbers of commands and registers are those that Aravis and Wireshark's dissector have in public.
 """
 
-from __future__ import annotations
-
 import contextlib
 import select
 import socket

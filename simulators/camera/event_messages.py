@@ -5,8 +5,6 @@ port of 0 closes the channel. Where it writes a time limit as well, each message
 many times as it allows.
 """
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import struct

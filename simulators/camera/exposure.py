@@ -1,7 +1,5 @@
 """What a simulated camera is set to for an exposure, and what it sends of the counts that its pixel source gives."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -3,8 +3,6 @@
 Each chunk ends with its number and its length.
 """
 
-from __future__ import annotations
-
 import random
 import socket
 import struct

@@ -8,8 +8,6 @@ One camera occupies one address. A second one at the same time needs a second lo
 with `ip addr add 127.0.0.2/8 dev lo`.
 """
 
-from __future__ import annotations
-
 import socket
 import struct
 import threading

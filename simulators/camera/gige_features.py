@@ -1,7 +1,5 @@
 """The GenICam description of a camera with the features of a table; the registers behind them are ours."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

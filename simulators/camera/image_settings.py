@@ -4,8 +4,6 @@ The names are those of the SFNC and of makers' feature lists; the effects are th
 form. This list is the simulator's own: the driver has another, by patterns, of what has to be off.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any, Protocol

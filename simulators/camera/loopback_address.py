@@ -1,7 +1,5 @@
 """One simulated camera per loopback address: Aravis starts a second one there without complaint, and it is deaf."""
 
-from __future__ import annotations
-
 import errno
 import re
 import socket

@@ -4,8 +4,6 @@ Each table is a file in `node_maps/` that names its public sources and what had 
 same features, names, steps and limits is what a driver meets on the real camera; registers and timing are ours.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

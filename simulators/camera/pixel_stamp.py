@@ -1,7 +1,5 @@
 """Numbers written into the first pixels of an image, so that a frame can testify when it was taken."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The whole of what an axis owes, in one class to inherit."""
 
-from __future__ import annotations
-
 from simulators.conformance.axis_faults import AxisFaults
 from simulators.conformance.axis_noise import EmulatorNoise
 from simulators.conformance.axis_promises import AxisPromises

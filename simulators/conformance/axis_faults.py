@@ -1,7 +1,5 @@
 """What every axis owes when things go wrong: an error in bounded time that names it, and never a wrong position."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

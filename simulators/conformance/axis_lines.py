@@ -1,7 +1,5 @@
 """What axes owe to others on their line, and to programs that have it."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -3,8 +3,6 @@
 A few moves in a suite; ``UMOV_FUZZ_ROUNDS=2000`` in the environment makes it minutes for each kind.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import os

@@ -1,7 +1,5 @@
 """What every axis owes in peace: nothing moves unasked, angles are right, limits hold, a stop stops."""
 
-from __future__ import annotations
-
 import logging
 import math
 import threading

@@ -1,7 +1,5 @@
 """What every camera owes: settings read back, whole frames of a known exposure, errors in bounded time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, Protocol
 

@@ -1,7 +1,5 @@
 """What every effect owes: nothing at zero, bounds and units that make sense, a derivative that is one, a cause."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import ClassVar

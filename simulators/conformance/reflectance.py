@@ -1,7 +1,5 @@
 """What every reflectance model owes: physical, reciprocal matrices, the same by both routes, read from a file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Emulated axes for the conformance tests: a fast clock, short waits, a port of its own."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What every light source owes: its light follows, is read back, and never ends in a state that nobody knows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Thorlabs APT units with a rotation stage, alone or in the bays of a rack; binary, with unsolicited messages."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Sequence
 from functools import partial

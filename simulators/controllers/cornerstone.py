@@ -1,7 +1,5 @@
 """Newport Oriel Cornerstone 260 behind a lamp, over RS-232: an echo, an answer, a grating drive, a shutter."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Thorlabs DC2200 with two LEDs: SCPI in lines, an error memory, LEDs off at power-up and in current mode."""
 
-from __future__ import annotations
-
 import re
 
 from drivers.sources.dc2200 import Config

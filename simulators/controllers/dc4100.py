@@ -4,8 +4,6 @@ The wire is that of `drivers/sources/dc4100.py`, whose docstring names the sourc
 numbers and texts, and that a refused setting leaves everything as it was.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from drivers.sources.dc4100 import Config

@@ -1,7 +1,5 @@
 """Thorlabs Elliptec rotation modules on one line: fixed-length packets, one reply at the end of a move."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Newport ESP301 with axes in degrees: commands in lines, an error memory, motors off at power-up."""
 
-from __future__ import annotations
-
 import re
 from collections import deque
 from collections.abc import Callable, Sequence

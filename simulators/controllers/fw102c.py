@@ -1,7 +1,5 @@
 """Thorlabs FW102C filter wheel: echo, answer, prompt; a move is answered when the wheel stands."""
 
-from __future__ import annotations
-
 from drivers.sources.fw102c import Config
 from simulators.clock import FastClock
 from simulators.serial.emulator import Emulator

@@ -1,7 +1,5 @@
 """A PI controller with the General Command Set 2 and rotation stages: servo off and not referenced at power-up."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

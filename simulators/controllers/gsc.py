@@ -3,8 +3,6 @@
 Commands, ranges and answers are those of the two manuals that `drivers.axes.gsc` names. `?:SW` is a SHOT-302GS's.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from functools import partial

@@ -1,7 +1,5 @@
 """ICP DAS I-7060 relay module: DCON protocol, four relays, a host watchdog that opens them."""
 
-from __future__ import annotations
-
 from drivers.sources.i7000 import Config
 from simulators.clock import FastClock
 from simulators.serial.emulator import Emulator

@@ -1,7 +1,5 @@
 """Thorlabs KURIOS-VB1 before a white lamp: a wavelength and a band, answers without an echo, a prompt."""
 
-from __future__ import annotations
-
 import re
 
 from drivers.sources.kurios import BLACK, READY, Config

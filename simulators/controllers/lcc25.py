@@ -1,7 +1,5 @@
 """Thorlabs LCC25 with a liquid crystal: echo, answer, prompt; two voltages, a mode, an output that can be off."""
 
-from __future__ import annotations
-
 import re
 
 from drivers.axes.lcc25 import HIGHEST_V, Config

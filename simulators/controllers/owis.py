@@ -1,7 +1,5 @@
 """OWIS PS90 with rotation stages: a letter of state for each axis, targets that are set and then gone to."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 

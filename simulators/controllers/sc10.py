@@ -1,7 +1,5 @@
 """Thorlabs SC10 shutter controller: echo, answer, prompt; a toggle for the enable state, an interlock input."""
 
-from __future__ import annotations
-
 import re
 
 from drivers.sources.sc10 import Config

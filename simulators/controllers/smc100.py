@@ -1,7 +1,5 @@
 """Newport SMC100 and CONEX controllers on one line: the state machine, its refusals and its error memory."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """A Standa 8SMC5 with a stepper rotation stage of 100 steps a degree: counts from where it was switched on."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 

@@ -3,8 +3,6 @@
 Unverified on hardware: the words of the rejections, the unit of speed and acceleration.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ there up to some point of their order. This is stricter than most file systems: 
 once its folder was synced.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass, field

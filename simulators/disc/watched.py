@@ -1,7 +1,5 @@
 """Counts the calls of this process that change a folder, and has one of them be the last (disc_calls.c)."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Which controllers are emulated, and what a rig file says of one that is served."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from collections.abc import Callable

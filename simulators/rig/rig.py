@@ -5,8 +5,6 @@ operator places, the filter in the source, and light that falls on the sensor wh
 stand.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import threading

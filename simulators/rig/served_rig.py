@@ -1,7 +1,5 @@
 """A simulated rig for other programs: emulators at ports that any client can open, and a rig file that names them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

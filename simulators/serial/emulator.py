@@ -1,7 +1,5 @@
 """What all emulated controllers share: an axis that moves in time, and replies that faults can spoil."""
 
-from __future__ import annotations
-
 import heapq
 import itertools
 import math

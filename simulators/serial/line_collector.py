@@ -1,7 +1,5 @@
 """Bytes as they come, in portions of any size, put together to lines of text."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 #: Bytes that a controller keeps of a line that does not end.

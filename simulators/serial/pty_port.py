@@ -1,7 +1,5 @@
 """Runs an emulator behind a pseudo-terminal, so that any serial client can open it like a real port."""
 
-from __future__ import annotations
-
 import errno
 import os
 import pty

@@ -1,7 +1,5 @@
 """Faults of an emulated controller on a schedule: what goes wrong, from which command or time on, for how long."""
 
-from __future__ import annotations
-
 import random
 import re
 from collections.abc import Iterable

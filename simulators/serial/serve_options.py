@@ -1,7 +1,5 @@
 """What `simulate serve` and the tests can choose for an emulated controller."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """What every port that serves an emulator has: a thread of its own, a way to stop it, and the error that ended it."""
 
-from __future__ import annotations
-
 import os
 import threading
 from abc import ABC, abstractmethod

@@ -1,7 +1,5 @@
 """Runs an emulator behind a TCP port, for controllers on the network that take several connections at once."""
 
-from __future__ import annotations
-
 import contextlib
 import selectors
 import socket

@@ -1,7 +1,5 @@
 """The order in which the runner asks for things, and what it does when one of them is wrong."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Where the counts of a camera end, found from its frames: every converter in every format; no end where none is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

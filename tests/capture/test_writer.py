@@ -1,7 +1,5 @@
 """What the writer does to the file, in which order: a state is on the disc before it is marked done."""
 
-from __future__ import annotations
-
 import errno
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """Readings that have to agree, on calm and on disturbed lines."""
 
-from __future__ import annotations
-
 import random
 
 import pytest

@@ -1,7 +1,5 @@
 """The camera when things go wrong: lost packets, stale frames, a stolen or vanished camera, Ctrl-C."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal

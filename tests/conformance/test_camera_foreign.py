@@ -1,7 +1,5 @@
 """Cameras that nobody here wrote: `arv-fake-gv-camera-0.8` of Debian's aravis-tools, and one of Aravis off Ethernet."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import time

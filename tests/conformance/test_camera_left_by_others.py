@@ -1,7 +1,5 @@
 """A camera as another program left it: each setting is brought to where it does nothing, or the capture is refused."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """The camera suite over the loopback GigE Vision camera: settings, frames, averages, formats, identity."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

@@ -1,7 +1,5 @@
 """The driver on the feature tables of makers' cameras: names, steps, formats and arming differ, the promises do not."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path

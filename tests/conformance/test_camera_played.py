@@ -1,7 +1,5 @@
 """The camera that plays a maker's GenICam description: what it does with one, and which it refuses."""
 
-from __future__ import annotations
-
 import re
 import socket
 import struct

@@ -1,7 +1,5 @@
 """Which arrivals belong to a trigger: frame numbers, and the camera's clock against the host's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A liquid-crystal retarder: bytes, what an axis owes, and a capture of named states in volts."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable
 from pathlib import Path

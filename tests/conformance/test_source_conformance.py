@@ -1,7 +1,5 @@
 """What every light source must do, run against each driver and its emulator; and the source switched by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

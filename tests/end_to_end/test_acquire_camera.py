@@ -1,7 +1,5 @@
 """What the camera is set to and what a capture makes of it: region, mosaic, trigger, darks that are not dark."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Devices that answer unlike ours, through the commands of `acquire`: CR-only lines, no checksums; a filter wheel."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from collections.abc import Callable

@@ -5,8 +5,6 @@ pixel beside where it is taken to begin, turn the angle by tens of degrees. CI t
 ``UMOV_EVERY_TABLE=1`` in the environment takes all formats of both tables in all phases.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from itertools import product

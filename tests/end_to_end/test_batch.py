@@ -1,7 +1,5 @@
 """Commands with several files and folders: one line each, nothing made twice, a failed one does not end the rest."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -3,8 +3,6 @@
 Tiled reads back what it was told, through its own server.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 import warnings

@@ -1,7 +1,5 @@
 """A Micro-Manager core and its own acquisition engine, unmodified, drive the emulated rig; its adapters make a rig."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

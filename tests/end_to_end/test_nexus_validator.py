@@ -1,7 +1,5 @@
 """The validator of NeXus (pynxtools, which nobody here wrote) over every kind of file. `.ci/nexus` brings it."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a night leaves: a summary, a word to somebody, a folder that can be processed although it was stopped."""
 
-from __future__ import annotations
-
 import http.server
 import io
 import json

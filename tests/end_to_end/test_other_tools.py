@@ -1,7 +1,5 @@
 """Captures and products open in tools that nobody here wrote: named dimensions, units, the default plot of NeXus."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from pathlib import Path

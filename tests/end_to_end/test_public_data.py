@@ -1,7 +1,5 @@
 """`data list` and `data get`: from a server, from a folder without a network, and every file by its SHA-256."""
 
-from __future__ import annotations
-
 import gc
 import hashlib
 import http.server

@@ -6,8 +6,6 @@ Each run is `acquire` in a child of its own, which ends by itself, is stopped, f
 killed at a drawn moment. Exit code 1 and the shortest order of steps that was found, if a promise is broken.
 """
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

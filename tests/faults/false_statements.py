@@ -8,8 +8,6 @@ is 1 if a capture of the first ten kinds passed without any of these. The last l
 every message there is a false alarm.
 """
 
-from __future__ import annotations
-
 import random
 import sys
 import tempfile

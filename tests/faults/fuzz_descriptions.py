@@ -1,7 +1,5 @@
 """GenICam descriptions to be spoilt, and how one is read to the end: a camera that is about to play it."""
 
-from __future__ import annotations
-
 import shutil
 import zipfile
 from pathlib import Path

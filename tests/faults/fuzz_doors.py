@@ -11,8 +11,6 @@ where a command that the file names was run or a place that it names was written
 --keep saves those inputs.
 """
 
-from __future__ import annotations
-
 import argparse
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """Ways to spoil a file: bytes, text, YAML trees and HDF5 trees. Every choice comes from one random generator."""
 
-from __future__ import annotations
-
 import copy
 import io
 import os

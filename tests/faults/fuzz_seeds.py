@@ -1,7 +1,5 @@
 """The doors that are fuzzed: sound files to begin with, and how each is read to the end."""
 
-from __future__ import annotations
-
 import json
 import random
 import shutil

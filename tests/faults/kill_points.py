@@ -10,8 +10,6 @@ After each kill the same command goes on. At its end every capture must be compl
 run in all but times and segments, and `acquire verify` must find nothing. Exit code 1 if anything is lost.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import fcntl

@@ -12,8 +12,6 @@ A fault after which the run goes on, as a guard that is killed and restarted, co
 watched: what is asked for then is that the light was off until the next guard confirmed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json

@@ -1,7 +1,5 @@
 """The simulated rig's file with other values, written where a benchmark works."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`acquire compress`: the same capture in fewer bytes, and only if it is whole."""
 
-from __future__ import annotations
-
 import h5py
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Rows of packed datasets, unpacked without HDF5, are what HDF5 reads; damage is an error of the file."""
 
-from __future__ import annotations
-
 import h5py
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """A colour polarization sensor: every colour is a mosaic of its own, wherever the region begins."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -3,8 +3,6 @@
 On an object whose light changes from pixel to pixel that alone is no fault of the instrument.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

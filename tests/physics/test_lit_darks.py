@@ -1,7 +1,5 @@
 """Darks that are not dark are found, and dark ones are left in peace whatever the sample looks like."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

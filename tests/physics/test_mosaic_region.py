@@ -1,7 +1,5 @@
 """A region at an odd offset: the analyzers are where the capture says, not where the instrument file has them."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What cameras tell on their message channel, heard by a socket of its own: Aravis opens no such channel."""
 
-from __future__ import annotations
-
 import socket
 import struct
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Cornerstone monochromators: the bytes of the manual, with and without an echo, and what is refused."""
 
-from __future__ import annotations
-
 import pytest
 
 from drivers.errors import CommandRejected, DeviceError, WrongDevice

@@ -1,7 +1,5 @@
 """DC2200 LED driver: SCPI transcripts, one LED at a time, and a device file that is read by messages."""
 
-from __future__ import annotations
-
 import os
 import pty
 import tty

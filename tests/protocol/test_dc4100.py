@@ -1,7 +1,5 @@
 """Thorlabs DC4100 on the wire, line by line as Micro-Manager's adapter sends it."""
 
-from __future__ import annotations
-
 import pytest
 
 from drivers.errors import CommandRejected

@@ -1,7 +1,5 @@
 """FW102C filter wheel: byte transcripts, filters that choose the wavelength, and two ways to make dark."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

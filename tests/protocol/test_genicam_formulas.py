@@ -1,7 +1,5 @@
 """Formulas and registers of GenICam descriptions."""
 
-from __future__ import annotations
-
 import pytest
 
 from simulators.camera.genicam.formula import Formula, FormulaError

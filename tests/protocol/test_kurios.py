@@ -1,7 +1,5 @@
 """KURIOS tunable filter: byte transcripts, the band BLACK, and what is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

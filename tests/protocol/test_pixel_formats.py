@@ -1,7 +1,5 @@
 """Pixel formats byte by byte, from the GenICam naming convention and GigE Vision."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

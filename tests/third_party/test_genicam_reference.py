@@ -1,7 +1,5 @@
 """Descriptions of the simulated cameras, read by the reference implementation of GenApi (EMVA, package genicam)."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

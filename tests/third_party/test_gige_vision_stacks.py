@@ -1,7 +1,5 @@
 """GigE Vision stacks that nobody here wrote (viva-genicam, telegenicam), on loopback and across a virtual cable."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """`process design --optimize angles`: every angle free, and motor time as a second goal."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import typer

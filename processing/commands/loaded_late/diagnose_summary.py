@@ -1,7 +1,5 @@
 """What `diagnose` prints, and its result as a file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`diagnose --reflectance`: the dominant process of a material in place of an unknown sample."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

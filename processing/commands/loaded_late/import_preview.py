@@ -1,7 +1,5 @@
 """What `process import --dry-run` shows: the states as understood, and a strip of their frames."""
 
-from __future__ import annotations
-
 from itertools import islice
 
 import numpy as np

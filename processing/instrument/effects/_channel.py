@@ -1,7 +1,5 @@
 """One number for each detector channel."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from processing.instrument.changes import Conditions

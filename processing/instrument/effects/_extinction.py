@@ -1,7 +1,5 @@
 """What the effects of one polarizer of one train share."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import ClassVar, Literal
 

@@ -1,7 +1,5 @@
 """A sentence of the grammar as an effect; the place is its text."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

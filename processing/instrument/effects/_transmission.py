@@ -1,7 +1,5 @@
 """Transmission that depends on how far an element has turned."""
 
-from __future__ import annotations
-
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions

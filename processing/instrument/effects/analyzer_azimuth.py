@@ -5,8 +5,6 @@ An unknown sample does not separate it from an azimuth error of the analyzer's r
 Mend: calibrate on air; look through crossed polarizers and note the dark position.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ Cause: the camera body or the analyzer unit is mounted at an angle.
 Mend: level it against the source's polarizer with the arm at 180 degrees.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

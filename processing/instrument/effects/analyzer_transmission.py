@@ -5,8 +5,6 @@ sensitive to polarization, or the light that comes to it is polarized.
 Mend: put a depolarizer or a fixed polarizer behind the turning one; or turn the retarder instead of the polarizer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from processing.instrument.changes import Conditions

@@ -5,8 +5,6 @@ Mend: read the position after the stage is idle, allow it to settle, calibrate w
 With one known sample, one channel and one throughput it can explain any residual, so it has no name there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from processing.arrays import Array

@@ -1,7 +1,5 @@
 """Effects of an instrument, and families that declare what several of them have in common (see `Effect`)."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal

@@ -4,8 +4,6 @@ Cause: a wedged or tilted plate on a turning axis deviates the beam once per tur
 Mend: use a plate with under an arc minute of wedge, set it normal to the axis; register the frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

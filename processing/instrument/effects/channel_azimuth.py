@@ -4,8 +4,6 @@ Cause: lithography of the micropolarizers turned against the pixel grid, a Wolla
 Mend: turn a polarizer before the camera and fit each channel's azimuth.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.arrays import Array

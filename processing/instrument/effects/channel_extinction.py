@@ -4,8 +4,6 @@ Cause: wire grids have an extinction of 1:100 to 1:500 that falls towards the bl
 Mend: measure each channel behind a turning polarizer and put the extinctions into the model.
 """
 
-from __future__ import annotations
-
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions

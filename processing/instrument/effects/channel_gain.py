@@ -4,8 +4,6 @@ Cause: transmission of the micropolarizers differs between the four azimuths, re
 Mend: divide by a flat of unpolarized light (integrating sphere), channel by channel.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.arrays import Array

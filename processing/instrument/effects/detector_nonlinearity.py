@@ -5,8 +5,6 @@ Mend: measure signal against exposure time at constant light, stay below about 7
 counts = light (1 - c light / full scale), which is inverted exactly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ Under an unknown sample it looks like depolarization, and like stray light of a 
 Mend: take dark states with the same exposure before and after; fix the black level in the camera.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

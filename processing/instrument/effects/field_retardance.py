@@ -5,8 +5,6 @@ wedge, a temperature gradient, stress from the mount.
 Mend: put the plate where the beam is collimated, use a true zero-order plate; or calibrate on air, pixel by pixel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

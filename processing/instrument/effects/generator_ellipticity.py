@@ -4,8 +4,6 @@ Cause: stress in a window or prism behind the polarizer, a polarizer before a bi
 Mend: put the polarizer last before the retarder; look for stress between crossed polarizers; loosen the mount.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ Cause: the mount of camera or sample warms up or sags.
 Mend: let the bench settle, stiffen it, register the frames on a fixed mark.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from processing.arrays import Array

@@ -5,8 +5,6 @@ absorbs it: only air, a mirror or another known sample shows it.
 Mend: look between crossed polarizers for the strained part; put the element's Mueller matrix into the train.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ In uniform light it lowers the contrast of all channels alike, as a leak of the 
 Mend: a longer focal length or smaller aperture; unmix with the neighbours' weights from a turning polarizer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ Cause: the plate warms up (motor, lamp, room), a liquid-crystal cell or a stress
 Mend: let it settle before the first state, keep lamp and motor away from the plate, use an athermal pair.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

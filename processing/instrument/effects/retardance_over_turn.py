@@ -5,8 +5,6 @@ plate and beam are both tilted to the axis.
 Mend: centre the plate on the beam and set both along the axis; use a true zero-order plate, which tilt changes least.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

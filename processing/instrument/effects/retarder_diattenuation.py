@@ -4,8 +4,6 @@ Cause: Fresnel losses of a tilted or uncoated plate, a dichroic polymer, dust al
 Mend: tilt the plate back to normal incidence; measure both transmissions and put them into the model.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from processing.arrays import Array

@@ -5,8 +5,6 @@ polarized light on the plate, or a polarization-dependent reflection.
 Mend: clean and centre the plate, open the stop, set it normal to the axis; then divide by a turn without polarizers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from processing.instrument.changes import Conditions

@@ -4,8 +4,6 @@ Cause: play in worm, gear or belt. It needs states that are reached from both si
 Mend: approach every position from the same side (most controllers have a setting), or take the encoder on the shaft.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

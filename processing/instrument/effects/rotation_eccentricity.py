@@ -4,8 +4,6 @@ Cause: the encoder's scale or the worm wheel sits eccentric on the shaft (once),
 Mend: map the error with a second encoder or on air, and write the correction into the controller or the model.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ published case: acquisition turned the analyzer by -4.91 times the generator's a
 Mend: turn ten turns and look at the mark; correct the counts per degree or the sign in the rig file.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from processing.arrays import Array

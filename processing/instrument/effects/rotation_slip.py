@@ -5,8 +5,6 @@ Mend: lower speed and acceleration, tighten, home and repeat the capture from th
 The diagnosis finds the state: its place is AXIS@STATE, the first state that is off (counted from 0).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ Cause: too long an exposure for the brightest state, a glint.
 Mend: shorten the exposure or bracket it. Clipped counts cannot be recovered: the correction excludes those pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from processing.arrays import Array

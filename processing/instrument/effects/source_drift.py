@@ -4,8 +4,6 @@ Cause: warming up (which slows down: the curvature), ageing, a thermal drift of 
 Mend: warm up for an hour, monitor the source with a second detector and divide, close the loop on its power.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from processing.arrays import Array

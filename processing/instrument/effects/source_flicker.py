@@ -5,8 +5,6 @@ that does not repeat.
 Mend: monitor the source, average longer, lock the exposure to the mains; two channels of one beam splitter cancel it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from processing.arrays import Array

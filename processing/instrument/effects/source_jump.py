@@ -4,8 +4,6 @@ Cause: a capture was interrupted and resumed: the lamp was off in between, or co
 Mend: let the source warm up again before you resume, or take the capture anew.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

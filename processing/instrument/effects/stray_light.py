@@ -5,8 +5,6 @@ A constant is within the column space of W: an unknown sample absorbs it.
 Mend: baffle; measure with the beam blocked before the generator and subtract that as dark.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from processing.arrays import Array

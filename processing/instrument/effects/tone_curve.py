@@ -4,8 +4,6 @@ Cause: a camera or file format with gamma correction (8-bit pictures usually hav
 Mend: turn gamma off, store raw counts; otherwise invert the curve first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

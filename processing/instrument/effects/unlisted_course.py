@@ -4,8 +4,6 @@ Cause: not known; the sentence gives its site and its course.
 Mend: look at the element that the sentence names; take the capture again.
 """
 
-from __future__ import annotations
-
 from processing.instrument.effects._sentence import SentenceEffect
 from processing.instrument.effects.base import OfOneCapture
 

@@ -4,8 +4,6 @@ Ossikovski, Opt. Lett. 36, 2330 (2011): L = ln M, Lm = (L - G L^T G) / 2 holds d
 (L + G L^T G) / 2 the depolarization that the medium builds up. For a medium that is uniform along the beam.
 """
 
-from __future__ import annotations
-
 import warnings
 from typing import NamedTuple
 

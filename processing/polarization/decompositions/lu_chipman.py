@@ -5,8 +5,6 @@ Lu and Chipman, J. Opt. Soc. Am. A 13, 1106 (1996), Eqs. 42-52. For det M < 0 th
 negative, Eq. 52.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -5,8 +5,6 @@ The rotation is the orthogonal polar factor of the 3 x 3 remainder, by Newton's 
 Frobenius scaling (Higham, Functions of Matrices, Sec. 8.6); it needs no eigenvectors and takes both signs of det.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

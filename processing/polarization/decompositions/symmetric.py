@@ -4,8 +4,6 @@ Ossikovski, J. Opt. Soc. Am. A 26, 1109 (2009). The two diattenuators come from 
 M G M^T G, G = diag(1, -1, -1, -1), the retarders from a singular value decomposition of what is left.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

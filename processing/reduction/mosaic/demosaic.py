@@ -4,8 +4,6 @@ Every method maps a float32 frame (rows, columns) to (channels, rows, columns), 
 `superpixel` gives half the size. docs/mosaic.md compares them on scenes with a known truth.
 """
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from collections.abc import Callable

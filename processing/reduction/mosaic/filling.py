@@ -1,7 +1,5 @@
 """Fills the gaps between the samples of one channel of a mosaic."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -3,8 +3,6 @@
 The same numbers as `methods/bilinear.py` followed by the solution for S, DoLP and AoLP, without the images between.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

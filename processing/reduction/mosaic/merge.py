@@ -1,7 +1,5 @@
 """One mosaic frame out of alike states: black, flat, exposure, and what is saturated left out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

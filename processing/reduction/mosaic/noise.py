@@ -6,8 +6,6 @@ the covariance of a linear method is, for each of the four positions, a sum over
 An adaptive method is linearized about the frame itself.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

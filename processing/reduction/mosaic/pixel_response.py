@@ -3,8 +3,6 @@
 Source: Powell and Gruev, Opt. Express 21, 21039 (2013).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

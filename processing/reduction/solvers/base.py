@@ -1,7 +1,5 @@
 """What every solver of Mueller matrices offers; solvers build on each other: W of the centre, of the place, weights."""
 
-from __future__ import annotations
-
 from typing import Any, Protocol
 
 from numpy.typing import NDArray

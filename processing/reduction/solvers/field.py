@@ -1,7 +1,5 @@
 """Inversion where W differs from pixel to pixel: a retardance that varies smoothly over the image."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

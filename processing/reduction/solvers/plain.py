@@ -1,7 +1,5 @@
 """Solve row blocks for Mueller elements with their standard errors and the residual, in one matrix product a tile."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

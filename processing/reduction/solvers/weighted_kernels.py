@@ -4,8 +4,6 @@ Packed symmetric 16 x 16 matrices are rows (136, pixels), lower triangle row by 
 so that every inner loop runs along pixels and becomes vector instructions; arithmetic is in float64.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ Mend: level it against the source's polarizer with the arm at 180 degrees. Or us
 polarization is symmetric about the horizontal line.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.arrays import Array

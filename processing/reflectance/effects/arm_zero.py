@@ -4,8 +4,6 @@ Cause: the arm was homed against another stop, its zero was never checked at 180
 Mend: look straight through without sample and set the zero where the image of the source is centred.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.arrays import Array

@@ -1,7 +1,5 @@
 """Effects of the reflectance: they bend the dominant process."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cache

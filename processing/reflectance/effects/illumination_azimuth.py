@@ -4,8 +4,6 @@ Cause: polarizer of the source not horizontal, arm or source rolled about the be
 Mend: level the source's polarizer against the camera's with the arm at 180 degrees.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.arrays import Array

@@ -4,8 +4,6 @@ Cause: rough or concave surfaces, a bright holder or table near the object.
 Mend: black cloth around the object, a thin pin as support; exclude concave parts from the fit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

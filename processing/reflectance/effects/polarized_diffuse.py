@@ -4,8 +4,6 @@ Cause: light that enters, scatters and emerges is partly polarized by the last r
 Mend: use a `polarized_diffuse` material instead of `first_surface`; fit its a and b at several geometries.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from processing.arrays import Array

@@ -4,8 +4,6 @@ Cause: an index from a table for another batch, wavelength, paint or finish; an 
 Mend: fit it (`process fit-material`), or measure it on a polished piece with an ellipsometer.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from processing.arrays import Array

@@ -4,8 +4,6 @@ Cause: sphere centre or mesh pose from another session, camera nudged, wrong pix
 Mend: register again on the outline (`process geometry`), put the object back on its pin.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

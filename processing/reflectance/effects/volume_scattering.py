@@ -5,8 +5,6 @@ of the amplitudes across and along the plane of scattering is then cos(2 theta_d
 Mend: take the material's dominant process from measurement; a first-surface index near one imitates it.
 """
 
-from __future__ import annotations
-
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.reflectance.changes import ReflectanceChanges

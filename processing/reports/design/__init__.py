@@ -1,7 +1,5 @@
 """The one look of umov's pages: a style sheet and templates, for reports as one file and for the application."""
 
-from __future__ import annotations
-
 from functools import cache
 from importlib.resources import files
 

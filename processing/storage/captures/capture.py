@@ -1,7 +1,5 @@
 """Read a capture: header, states done, angles read back, frames in row blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from functools import cached_property

@@ -5,8 +5,6 @@ polarizers, so the pixels of one colour are a plain polarization mosaic of half 
 interpolated between colours: light of one wavelength reaches the colours in very different strength.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path

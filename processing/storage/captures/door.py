@@ -1,7 +1,5 @@
 """What a capture file must hold before any of it is believed."""
 
-from __future__ import annotations
-
 import h5py
 import numpy as np
 

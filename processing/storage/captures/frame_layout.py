@@ -1,7 +1,5 @@
 """Frames of one detector that hold the images of several channels: beams side by side, or cells of a mosaic."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Protocol
 

@@ -4,8 +4,6 @@ A dimension scale (HDF5) gives a dimension its name and its coordinate, so that 
 (state, channel, y, x). The attributes of NXdata (signal, axes, NAME_indices) say the same to NeXus readers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import h5py

@@ -1,7 +1,5 @@
 """A complete capture written anew with its frames compressed: two to three times smaller, every value the same."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Both writers use it: `acquisition` state by state from the bench, `process import` from files of others.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from functools import partial

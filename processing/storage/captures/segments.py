@@ -5,8 +5,6 @@ campaign: the light and the settings may have changed in between, so what is con
 within a segment only.
 """
 
-from __future__ import annotations
-
 import json
 import zlib
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ tried on a file from the instrument: two public readers even disagree on the len
 the file.
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta

@@ -1,7 +1,5 @@
 """Mueller products from and to AxoStep's Mueller files."""
 
-from __future__ import annotations
-
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any

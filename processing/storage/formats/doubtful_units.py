@@ -1,7 +1,5 @@
 """Refuse numbers of another lab that are probably in another unit: no later step would notice."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Arrays and lists of frames of other programs: HDF5, .npy, .mat, and folders of pictures."""
 
-from __future__ import annotations
-
 import glob
 import re
 import zipfile

@@ -1,7 +1,5 @@
 """The doors for frames from elsewhere: pictures, and stacks in one file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What an import was asked for, for one measurement or for several."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path

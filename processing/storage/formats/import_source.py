@@ -1,7 +1,5 @@
 """Frames of all states of an import: of a folder, of pictures, of a stack, or the fluxes of a table."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor

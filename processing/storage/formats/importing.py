@@ -1,7 +1,5 @@
 """Make a capture out of data measured elsewhere: a table of states, and frames or channel fluxes."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable

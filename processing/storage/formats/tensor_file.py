@@ -1,7 +1,5 @@
 """Mitsuba's tensor file: named arrays in one binary file, as the reader in its source (core/tensor.cpp) wants them."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ They are written once, with the state, and verified wherever the state is read. 
 few rows need not read the whole frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

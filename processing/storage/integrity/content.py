@@ -1,7 +1,5 @@
 """What a file holds, as one number, without reading the frames of a capture: their checksums stand for them."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

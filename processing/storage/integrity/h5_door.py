@@ -1,7 +1,5 @@
 """The door for HDF5 and .npy files: names, types and shapes are looked at before anything is read."""
 
-from __future__ import annotations
-
 import os
 import tokenize
 import zipfile

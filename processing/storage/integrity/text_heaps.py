@@ -5,8 +5,6 @@ free space at its end is object 0. A free space of no size makes HDF5 2.0 read t
 (HDFGroup/hdf5 issue 1707), which neither a limit nor Ctrl-C ends.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from pathlib import Path

@@ -4,8 +4,6 @@ HDF5 unpacks one chunk after the other with zlib. What cannot be unpacked here i
 are the only ones.
 """
 
-from __future__ import annotations
-
 import sys
 from collections import OrderedDict
 from collections.abc import Iterator

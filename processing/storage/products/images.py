@@ -1,7 +1,5 @@
 """Mueller and Stokes images read back from product files, with what error propagation needs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The planes of a Mueller product: what every image of Mueller matrices holds beside the matrices."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.storage.products.pixel_mask import Mask

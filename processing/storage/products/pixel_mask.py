@@ -1,7 +1,5 @@
 """What is wrong with a pixel of a product, as bits."""
 
-from __future__ import annotations
-
 from enum import IntFlag
 
 

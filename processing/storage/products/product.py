@@ -4,8 +4,6 @@ Layout (docs/processing.md): planes first, then (rows, columns); `<name>_errors`
 value; every step that led here is an NXprocess with its arguments, oldest first.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

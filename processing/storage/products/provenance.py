@@ -1,7 +1,5 @@
 """Provenance of a product: the steps that led to it, with options, content of the inputs, program and date."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence

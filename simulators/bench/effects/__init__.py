@@ -1,7 +1,5 @@
 """What a real bench does that its declared model does not: one small object a cause, sorted by where it acts."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import Field

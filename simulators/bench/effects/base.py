@@ -5,8 +5,6 @@ electrons before the detector collects it, `detector` the electrons collected. E
 its size in physical units, and does nothing at size zero.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Detectors that answer crookedly: response, fixed pattern, black level."""
 
-from __future__ import annotations
-
 import zlib
 from typing import Literal
 

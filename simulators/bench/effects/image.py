@@ -1,7 +1,5 @@
 """Images that move, and light that reaches pixels where it does not belong."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Axes that do not stand where they say: offset, scale, wobble, jitter, slip, play."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Optics that are not as declared: elements, plates, channels, retardance that varies over the image."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Literal
 

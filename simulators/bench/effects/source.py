@@ -1,7 +1,5 @@
 """Light that changes or is uneven."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

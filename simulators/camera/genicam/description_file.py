@@ -1,7 +1,5 @@
 """The door of GenICam descriptions: XML, or the zip archive with one XML file that most cameras serve."""
 
-from __future__ import annotations
-
 import io
 import lzma
 import zipfile

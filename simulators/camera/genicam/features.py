@@ -1,7 +1,5 @@
 """The features of a description that a camera does something about, by their standard (SFNC) names."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Formulas of GenICam nodes (`SwissKnife`, `Converter`): operators of C, with `=`, `<>`, `**` and some functions."""
 
-from __future__ import annotations
-
 import math
 import operator
 import re

@@ -4,8 +4,6 @@ Node types and their children are those of the GenApi module of the GenICam stan
 them: Integer, Float, Enumeration, Boolean, Command, the registers with computed addresses, SwissKnife and Converter.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -6,8 +6,6 @@ locked is not, an enumeration stands at its first entry, a number at its lower l
 read are the camera's own, so those are written to until a feature comes out as it should.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Sequence
 

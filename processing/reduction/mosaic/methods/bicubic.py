@@ -1,7 +1,5 @@
 """Cubic convolution (a = -1/2) of the channel's samples."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

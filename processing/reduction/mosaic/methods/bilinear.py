@@ -1,7 +1,5 @@
 """Mean of the nearest two or four samples of the channel."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@ The mean of all four channels around a pixel is known at full resolution; only e
 interpolated. Source: Mihoubi, Lapray, Bigué, Sensors 18, 3688 (2018).
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

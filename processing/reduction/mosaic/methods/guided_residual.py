@@ -3,8 +3,6 @@
 The guided filter is opencv-contrib's (`cv2.ximgproc.guidedFilter`), its source the bilinear channel.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

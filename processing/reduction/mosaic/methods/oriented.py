@@ -7,8 +7,6 @@ pass finds an edge, the fields are taken as smoother along it, and kernels for 1
 pass every kernel unchanged. The priors below were set on scenes that docs/studies/mosaic.md does not use.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import cv2

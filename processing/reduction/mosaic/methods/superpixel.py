@@ -1,7 +1,5 @@
 """Each 2 x 2 super-pixel becomes one pixel: half the size, no interpolation."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
