@@ -3,8 +3,6 @@
 PYTHONPATH=. python benchmarks/effects_page.py
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -70,14 +68,14 @@ class Described:
     remedy: str
 
     @classmethod
-    def of(cls, kind: str, module: str) -> Described:
+    def of(cls, kind: str, module: str) -> "Described":
         """Read the sections of a module's docstring."""
         title, _, rest = module.partition("\n\n")
         _, _, rest = rest.partition("Cause:")
         cause, _, remedy = rest.partition("Mend:")
         return cls(kind, *(" ".join(text.split()) for text in (title, cause, remedy)))
 
-    def lines(self, before: Sequence[Described]) -> str:
+    def lines(self, before: "Sequence[Described]") -> str:
         """Heading, title, cause and remedy; a reference where an effect `before` has the same."""
         head = f"\n### {self.kind}\n\n{wrapped(self.title)}\n\n"
         for other in before:

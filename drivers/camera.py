@@ -5,8 +5,6 @@ changed there holds for the whole of the next frame. Frames that belong to no ex
 and counted; frames that did not arrive whole are never handed out.
 """
 
-from __future__ import annotations
-
 import logging
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -110,7 +108,7 @@ class CameraIdentity:
 class Exposure:
     """One exposure under way, made by `Camera.trigger`."""
 
-    def __init__(self, camera: Camera, earlier: FrameAverage | None) -> None:
+    def __init__(self, camera: "Camera", earlier: FrameAverage | None) -> None:
         self._camera = camera
         self._earlier = earlier
         self._exposed = False

@@ -1,7 +1,5 @@
 """A motion axis: angles in degrees with one documented zero, limits, and motions that end in bounded time."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import math
@@ -48,7 +46,7 @@ class Motion:
         Where a move begins, as read before it; None for homing.
     """
 
-    def __init__(self, axis: MotionAxis, target_deg: float | None, expected_s: float, allowed_s: float) -> None:
+    def __init__(self, axis: "MotionAxis", target_deg: float | None, expected_s: float, allowed_s: float) -> None:
         self.axis = axis
         self.target_deg = target_deg
         self.start: Position | None = None

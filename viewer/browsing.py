@@ -1,7 +1,5 @@
 """The first page, and the page of a campaign."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -67,7 +65,7 @@ class Listed:
         key: str,
         request: Request,
         groups: Mapping[str, Callable[[Entry], str]] = MappingProxyType({}),
-    ) -> Listed:
+    ) -> "Listed":
         """The page that a request asks for with `<key>_page`, `<key>_sort` and `<key>_group`; newest files first.
 
         Parameters

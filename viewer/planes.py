@@ -1,7 +1,5 @@
 """Reduced reads: any part of a frame or of a map, with no more pixels than a screen shows."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass
@@ -32,7 +30,7 @@ class Window:
     step: int
 
     @classmethod
-    def asked(cls, query: Any, shape: tuple[int, int], most: int = MOST) -> Window:
+    def asked(cls, query: Any, shape: tuple[int, int], most: int = MOST) -> "Window":
         """The part that a request asks for with x0, x1, y0, y1 and most; default: all of it.
 
         Raises

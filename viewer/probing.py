@@ -1,7 +1,5 @@
 """A pixel or a region looked at closely: intensities with the fitted curve, Mueller matrix, what it decomposes into."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,7 +30,7 @@ class Region:
     columns: slice
 
     @classmethod
-    def asked(cls, query: Any, shape: tuple[int, int]) -> Region:
+    def asked(cls, query: Any, shape: tuple[int, int]) -> "Region":
         """The region of a request, inside the image. Raises ProcessError where its numbers are none."""
         try:
             x0, y0 = int(query["x0"]), int(query["y0"])
@@ -43,11 +41,11 @@ class Region:
             raise ProcessError(f"columns {x0} to {x1}, rows {y0} to {y1} do not lie in {shape[1]} x {shape[0]} pixels")
         return cls(slice(y0, y1), slice(x0, x1))
 
-    def enlarged(self, times: int) -> Region:
+    def enlarged(self, times: int) -> "Region":
         """The same place in an image of so many times as many rows and columns."""
         return Region(*(slice(times * part.start, times * part.stop) for part in (self.rows, self.columns)))
 
-    def reduced(self, times: int) -> Region:
+    def reduced(self, times: int) -> "Region":
         """The cells of so many rows and columns that it touches, as a region of an image of one pixel a cell."""
         return Region(*(slice(part.start // times, -(-part.stop // times)) for part in (self.rows, self.columns)))
 

@@ -1,7 +1,5 @@
 """What a RunEngine waits for, and work in a thread that ends it."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 
@@ -31,7 +29,7 @@ class MoveStatus:
             raise TimeoutError("not done yet")
         return self._error
 
-    def add_callback(self, callback: Callable[[MoveStatus], None]) -> None:
+    def add_callback(self, callback: "Callable[[MoveStatus], None]") -> None:
         """Have a function called at the end, at once if that has been."""
         with self._lock:
             if not self.done:

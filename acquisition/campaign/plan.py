@@ -1,7 +1,5 @@
 """A campaign: samples x wavelengths x modes x arm angles, as one frozen value, iterated into captures."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -125,7 +123,7 @@ class Campaign(FiniteSection):
         return self
 
     @classmethod
-    def load(cls, path: Path | str) -> Campaign:
+    def load(cls, path: Path | str) -> "Campaign":
         """Read a campaign file; its paths become absolute. Raises ConfigError with file, line and key."""
         campaign = load_yaml(path, cls)
         folder = Path(path).resolve().parent

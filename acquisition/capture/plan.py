@@ -1,7 +1,5 @@
 """A measurement plan: one capture as a value, read from YAML, iterated into states."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeAlias
@@ -177,11 +175,11 @@ class MeasurementPlan(FiniteSection):
         return self
 
     @classmethod
-    def load(cls, path: Path | str) -> MeasurementPlan:
+    def load(cls, path: Path | str) -> "MeasurementPlan":
         """Read a plan file. Raises ConfigError with file, line and key."""
         return load_yaml(path, cls)
 
-    def with_changes(self, **changes: Any) -> MeasurementPlan:
+    def with_changes(self, **changes: Any) -> "MeasurementPlan":
         """A copy with the values that are not None, validated again. Raises ConfigError."""
         chosen = {name: value for name, value in changes.items() if value is not None}
         try:

@@ -4,8 +4,6 @@ All space is taken before the first motion. Each state is written, synced, marke
 process, while the next state is under way. A finished file loses its `.partial` and is on the disc by then.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os
@@ -124,7 +122,7 @@ class CaptureWriter:
         start_time: str,
         begin: Mapping[str, Any] | None = None,
         clock: Clock = REAL,
-    ) -> CaptureWriter:
+    ) -> "CaptureWriter":
         """Create `path` + ".partial" with everything allocated.
 
         Parameters

@@ -7,8 +7,6 @@ reach without another look (conservative advancement: Mirtich, "Impulse-based dy
 systems", 1996, section 2.3); nothing between two looks can be missed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -40,7 +38,7 @@ class Footprint:
         """Largest distance of any of its points from the vertical through the origin."""
         return float(np.hypot(*self.corners_mm.T).max()) + self.radius_mm
 
-    def turned(self, angle_deg: float) -> Footprint:
+    def turned(self, angle_deg: float) -> "Footprint":
         """The same, turned from +z towards +x."""
         c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
         x, z = self.corners_mm.T

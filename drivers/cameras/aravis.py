@@ -4,8 +4,6 @@ Names of features are those of the GenICam SFNC with the older ones as second ch
 Aravis 0.8.26 and its loopback GigE Vision camera; not yet on a camera of a maker.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import threading
@@ -42,7 +40,7 @@ _EARLY, _EARLY_S = 0.02, 1e-3
 _CHECK_LINK = "Check cable, packet size and network load (acquire doctor measures the packet loss)"
 
 
-def open(name: str, config: Config, clock: Clock = REAL) -> AravisCamera:
+def open(name: str, config: Config, clock: Clock = REAL) -> "AravisCamera":
     """Open the camera and take control of it; nothing is set and nothing is exposed.
 
     Parameters

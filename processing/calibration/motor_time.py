@@ -1,7 +1,5 @@
 """The time that motors need for a table of states, its best order, and what a faster table costs in variance."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -29,7 +27,7 @@ class Speed:
     deg_s2: float
 
     @classmethod
-    def parse(cls, text: str) -> tuple[str, Speed]:
+    def parse(cls, text: str) -> "tuple[str, Speed]":
         """AXIS=SPEED or AXIS=SPEED:ACCELERATION, degrees and seconds; without acceleration one of half a second."""
         name, _, numbers = text.partition("=")
         try:

@@ -4,8 +4,6 @@ Every value is linear in what is searched: a mount's change is one number for al
 number at each wavelength, or the coefficients of a curve.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -93,7 +91,7 @@ class TrainValues:
         names: Sequence[str],
         wavelengths_nm: Sequence[float],
         curve: WavenumberCurve | None,
-    ) -> TrainValues:
+    ) -> "TrainValues":
         """Mounts once, the rest along the curve; without a curve, or where the file says so, at each wavelength."""
         unknown: list[Unknown] = []
         for name in names:

@@ -5,8 +5,6 @@ from its absorption changes little and smoothly: a straight line in 1/wavelength
 an achromatic one. A constant is one coefficient.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -32,7 +30,7 @@ class WavenumberCurve:
     coefficients: int
 
     @classmethod
-    def over(cls, wavelengths_nm: Sequence[float], coefficients: int) -> WavenumberCurve:
+    def over(cls, wavelengths_nm: Sequence[float], coefficients: int) -> "WavenumberCurve":
         """Curves through values at these wavelengths.
 
         Raises

@@ -4,8 +4,6 @@ Our problems are many and small, or spread over our own threads: those of BLAS w
 machine ten times as long as the work takes, and the last bits of a result would depend on how many there are.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator
@@ -20,7 +18,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 THREADS_VARIABLE = "OPENBLAS_NUM_THREADS"
 
 _gate = Lock()
-_within: list[_OneThread] = []
+_within: "list[_OneThread]" = []
 
 
 @contextmanager
@@ -56,7 +54,7 @@ class _OneThread:
     variable: str | None
 
     @classmethod
-    def begin(cls) -> _OneThread:
+    def begin(cls) -> "_OneThread":
         threads = None
         if not _has_scipy():
             threads = max((pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"), default=1)

@@ -6,8 +6,6 @@ that a measured Mueller image is in; with up = n they are Jarecki and Kupinski's
 surface (docs/conventions.md); with up = h, x is the axis s of the facet for both beams, as in a renderer's table.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -90,15 +88,15 @@ class ScatteringGeometry:
         """x, y of the analyzer's beam, each (..., 3); ko = wo."""
         return transverse_axes(self.to_camera, self.up)
 
-    def with_up(self, up: ArrayLike) -> ScatteringGeometry:
+    def with_up(self, up: ArrayLike) -> "ScatteringGeometry":
         """The same directions, referred to other transverse axes."""
         return ScatteringGeometry(self.normal, self.to_source, self.to_camera, np.asarray(up, dtype=np.float64))
 
-    def reversed(self) -> ScatteringGeometry:
+    def reversed(self) -> "ScatteringGeometry":
         """Source and camera exchanged (for reciprocity)."""
         return ScatteringGeometry(self.normal, self.to_camera, self.to_source, self.up)
 
-    def __getitem__(self, index: Any) -> ScatteringGeometry:
+    def __getitem__(self, index: Any) -> "ScatteringGeometry":
         """The points that `index` picks (any numpy index of the leading axes)."""
         up = self.up if self.up.ndim == 1 else self.up[index]
         return ScatteringGeometry(self.normal[index], self.to_source[index], self.to_camera[index], up)

@@ -1,7 +1,5 @@
 """A triangle mesh in front of the camera, by ray casting (trimesh with embree)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -40,7 +38,7 @@ class Mesh(Section):
     smooth_normals: bool = Field(default=True, description="interpolate normals between the corners of a triangle")
     allow_holes: bool = Field(default=False, description="take a mesh that is not closed")
 
-    def relative_to(self, folder: Path) -> Mesh:
+    def relative_to(self, folder: Path) -> "Mesh":
         """The same mesh with its file looked up from `folder`."""
         return self.model_copy(update={"file": str(folder / self.file)})
 
@@ -80,7 +78,7 @@ class Mesh(Section):
         start = points_mm + towards * (1e-4 * world.size_mm)
         return np.asarray(_first_hits(world.scene, start, towards) >= 0)
 
-    def _world(self) -> _World:
+    def _world(self) -> "_World":
         path = Path(self.file)
         try:
             stamp = path.stat().st_mtime_ns

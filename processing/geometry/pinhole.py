@@ -1,7 +1,5 @@
 """The camera as a pinhole: focal length, pixel pitch, distance, distortion."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydantic import Field
 
@@ -41,7 +39,7 @@ class PinholeCamera(Section):
         """(3,), centre of projection in the world, mm."""
         return np.array([0.0, 0.0, self.distance_mm])
 
-    def resized(self, rows: int, columns: int) -> PinholeCamera:
+    def resized(self, rows: int, columns: int) -> "PinholeCamera":
         """The same lens and field of view in height, with another number of pixels."""
         zoom = rows / self.rows
         row, column = self.axis_px

@@ -1,7 +1,5 @@
 """Camera, source and object together: the scattering geometry of every pixel at an arm angle."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
@@ -38,11 +36,11 @@ class ViewingGeometry(Section):
     arm_zero_deg: float = Field(default=0.0, description="what is added to the arm's reading, degrees")
 
     @classmethod
-    def load(cls, path: Path | str) -> ViewingGeometry:
+    def load(cls, path: Path | str) -> "ViewingGeometry":
         """Read a geometry file. Raises ConfigError with file, line and key."""
         return load_yaml(path, cls).relative_to(Path(path).parent)
 
-    def relative_to(self, folder: Path) -> ViewingGeometry:
+    def relative_to(self, folder: Path) -> "ViewingGeometry":
         """The same geometry with the file of a mesh looked up from `folder`."""
         if not isinstance(self.shape, Mesh):
             return self

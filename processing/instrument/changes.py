@@ -1,7 +1,5 @@
 """What effects change in the forward model of one capture: elements, gains and counts, state by state."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping
 from copy import copy
@@ -49,7 +47,7 @@ class Conditions:
         object.__setattr__(self, "run", np.broadcast_to(self.run, (self.states,)))
 
     @classmethod
-    def of(cls, angles_deg: Mapping[str, Array], channels: tuple[str, ...] = ("camera",)) -> Conditions:
+    def of(cls, angles_deg: Mapping[str, Array], channels: tuple[str, ...] = ("camera",)) -> "Conditions":
         """Conditions of bare angles: equal steps in time, full scale 1."""
         sizes = {np.size(v) for v in angles_deg.values()} or {1}
         n = sizes.pop()
@@ -131,7 +129,7 @@ class Changes:
         self.shift_px = np.zeros((self.conditions.states, 2))
         self.blur_px2 = np.zeros(self.conditions.states)
 
-    def of_states(self, chosen: NDArray[np.int64]) -> Changes:
+    def of_states(self, chosen: NDArray[np.int64]) -> "Changes":
         """The same for some of the states, by their positions."""
         states, c = self.conditions.states, self.conditions
 

@@ -4,8 +4,6 @@ Any rotating-element polarimeter is a YAML file: a generator train and an analyz
 fixed or turned by a named axis, and one or more detector channels (docs/conventions.md, "Instrument").
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -167,7 +165,7 @@ class InstrumentModel(Section):
         return self
 
     @classmethod
-    def load(cls, path: Path | str) -> InstrumentModel:
+    def load(cls, path: Path | str) -> "InstrumentModel":
         """Read an instrument file. Raises ConfigError with file, line and key."""
         return load_yaml(path, cls)
 
@@ -201,7 +199,7 @@ class InstrumentModel(Section):
             return tuple(sorted(self.measured.angles_deg))
         return tuple(sorted({e.axis for e in self.elements() if e.axis is not None}))
 
-    def at(self, wavelength_nm: float) -> InstrumentModel:
+    def at(self, wavelength_nm: float) -> "InstrumentModel":
         """The model with every dispersive value resolved at one wavelength.
 
         Raises
@@ -235,7 +233,7 @@ class InstrumentModel(Section):
         resolved["correlations"] = [c for c in resolved["correlations"] if holds(c)]
         return InstrumentModel.model_validate(resolved | {"wavelengths_nm": (wavelength_nm,)})
 
-    def nominal_at(self, wavelength_nm: float) -> InstrumentModel:
+    def nominal_at(self, wavelength_nm: float) -> "InstrumentModel":
         """`at`, where values that are nominal anyway (`calibrate`) come from the nearest wavelengths that have them.
 
         For whoever fits them: between two wavelengths a straight line, beyond the last one its value.
@@ -256,7 +254,7 @@ class InstrumentModel(Section):
         parts = self.channels if field == "gain" else self.elements()
         return next((getattr(p, field, None) for p in parts if p.name == place), None)
 
-    def with_values(self, values: Mapping[str, Mapping[str, Any]]) -> InstrumentModel:
+    def with_values(self, values: Mapping[str, Mapping[str, Any]]) -> "InstrumentModel":
         """The model with other values of its elements and channels: name to field to value."""
 
         def new(name: str, *, gain: bool) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """State tables: which angles, exposure and role each state of a measurement has."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -59,7 +57,7 @@ class StateTable:
         return len(self.role)
 
     @classmethod
-    def of_angles(cls, angles_deg: Mapping[str, NDArray[np.float64]], exposure_s: float = 1.0) -> StateTable:
+    def of_angles(cls, angles_deg: Mapping[str, NDArray[np.float64]], exposure_s: float = 1.0) -> "StateTable":
         """Sample states of one exposure at these angles, axis name to (N,)."""
         n = len(next(iter(angles_deg.values())))
         sample: Role = "sample"

@@ -9,8 +9,6 @@ the delta method with its second-order term.
 Where the small eigenvalues differ by more than noise, the shift is that of their own gaps.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,7 +61,7 @@ class EigenvalueNoise:
     @classmethod
     def of(
         cls, total: Array, row: Array, diagonal: Array, along: Array, *, m00: Array, with_m00: Array
-    ) -> EigenvalueNoise:
+    ) -> "EigenvalueNoise":
         """From second moments of the noise E of H / (2 m00) about the dominant process v.
 
         Parameters

@@ -4,8 +4,6 @@ First order, so it holds where a quantity is smooth over the errors. It does not
 a magnitude smaller than about three of its errors is biased upwards, and equal eigenvalues are pushed apart by noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -27,7 +25,7 @@ class Derived(NamedTuple):
     """(..., pixels..., 16)"""
     elements: tuple[int, ...] = ()
     """Of the length of a vector of elements over m00: their numbers, row-major."""
-    parts: Derived | None = None
+    parts: "Derived | None" = None
     """Of the length of another vector: its components (n, pixels...)."""
 
 

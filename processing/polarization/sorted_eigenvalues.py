@@ -5,8 +5,6 @@ both gaps; the shifts are those with which a bound holds as often as it claims, 
 is made by `benchmarks/eigenvalue_table.py`.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -45,7 +43,7 @@ class Sorted(NamedTuple):
     below: Array
     above: Array
 
-    def with_mean(self, u: Array) -> Sorted:
+    def with_mean(self, u: Array) -> "Sorted":
         """Intervals where the mean of the three has this standard uncertainty (...) instead."""
 
         def wide(size: Array, deviate: float) -> Array:

@@ -5,8 +5,6 @@ others, black(t) = offset + dark current x t is fitted to them, pixel by pixel (
 numbers); its error is propagated. With one other exposure only, its mean is taken as it is, and a warning says so.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,13 +43,13 @@ class Black:
     scatter_stderr: Array
 
     @classmethod
-    def level(cls, counts: float) -> Black:
+    def level(cls, counts: float) -> "Black":
         """A black level without dark states."""
         none, unknown = np.zeros(1), np.full(1, np.nan)
         return cls(np.full((1, 1, 1, 1), counts, np.float32), unknown, none, none, unknown, unknown)
 
     @classmethod
-    def of(cls, capture: Capture) -> Black | None:
+    def of(cls, capture: Capture) -> "Black | None":
         """From the dark states of a capture; None without any."""
         dark = capture.states_with("dark")
         if dark.size == 0:

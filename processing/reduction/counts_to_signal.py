@@ -1,7 +1,5 @@
 """From raw counts to signal: black, flat, bad and saturated pixels, block by block."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -47,7 +45,7 @@ class CountCorrection:
         bad: NDArray[np.bool_] | None = None,
         dark_from: Capture | None = None,
         flat_from: Sequence[Capture] = (),
-    ) -> CountCorrection:
+    ) -> "CountCorrection":
         """What the capture offers: dark states, else the header's black level, else nothing (and says so).
 
         Parameters

@@ -1,7 +1,5 @@
 """The flat field: relative response of each pixel and unevenness of the light, from flat states."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +41,7 @@ class FlatField:
     @classmethod
     def of(
         cls, captures: list[Capture], black: Black | None = None, saturation: float | None = None
-    ) -> FlatField | None:
+    ) -> "FlatField | None":
         """From all flat states of some captures of one camera; None without any.
 
         Parameters
@@ -105,7 +103,7 @@ class FlatCapture:
     time_s: float
 
     @classmethod
-    def of(cls, capture: Capture) -> FlatCapture | None:
+    def of(cls, capture: Capture) -> "FlatCapture | None":
         """None unless every state with light is a flat state."""
         if not capture.states_with("flat").size or set(capture.role) - {"flat", "dark"}:
             return None

@@ -1,7 +1,5 @@
 """What a diagnosis found to be no measurement of the sample: states, struck intensities and bad pixels, left out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -43,7 +41,7 @@ class Exclusions:
     bad: NDArray[np.bool_] | None = None
 
     @classmethod
-    def read(cls, path: Path, capture: Capture) -> Exclusions:
+    def read(cls, path: Path, capture: Capture) -> "Exclusions":
         """From a result of `diagnose --json`; nothing where it tells of no such part of this capture.
 
         Raises

@@ -1,7 +1,5 @@
 """A capture to Mueller matrices: prepared once, applied to row blocks, a region or one pixel."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -145,7 +143,7 @@ class MuellerReduction:
         choice: Choice | None = None,
         *,
         left_out: Exclusions | None = None,
-    ) -> MuellerReduction:
+    ) -> "MuellerReduction":
         """Prepare the reduction of a capture; see `reduce_mueller` for parameters and errors."""
         left_out, choice = left_out or Exclusions(), choice or Choice()
         every = sample_states(capture)

@@ -1,7 +1,5 @@
 """Noise of a linear camera: variance in counts^2 as a straight line in the signal (EMVA 1288, "linear model")."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +34,7 @@ class NoiseModel:
     stated: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, detector: Detector, integer: bool) -> NoiseModel | None:
+    def of(cls, detector: Detector, integer: bool) -> "NoiseModel | None":
         """From the detector's constants; None if the gain is not known.
 
         `integer` adds the variance of rounding, which read noise in electrons does not contain.
@@ -50,7 +48,7 @@ class NoiseModel:
         return cls(1.0 / gain, read**2, QUANTIZATION if integer else 0.0, source)
 
     @classmethod
-    def of_sigma(cls, sigma: ArrayLike) -> NoiseModel:
+    def of_sigma(cls, sigma: ArrayLike) -> "NoiseModel":
         """From the standard deviation (N,) of one intensity of each state, counts: column `sigma` of the states."""
         return cls(0.0, 0.0, 0.0, "column sigma of the states", tuple(np.square(sigma).tolist()))
 

@@ -6,8 +6,6 @@ together with the Mueller matrices of all pixels, intensity = s_n W_n . vec(M), 
 polarizes) is held by their own scatter, a normal prior whose width has the highest likelihood (empirical Bayes).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -101,7 +99,7 @@ class SourceMoments:
     channels: int
 
     @classmethod
-    def read(cls, reader: BlockReader, middle: bool) -> SourceMoments | None:
+    def read(cls, reader: BlockReader, middle: bool) -> "SourceMoments | None":
         """Of the pixels of a capture that are sound in all states; None where there are none.
 
         `middle` : of the middle of the image alone, where W is the same all over it.
@@ -173,7 +171,7 @@ class LeveledSource:
     basis: Array
 
     @classmethod
-    def of(cls, reader: BlockReader, model: InstrumentModel, basis: Array, varies: bool) -> LeveledSource:
+    def of(cls, reader: BlockReader, model: InstrumentModel, basis: Array, varies: bool) -> "LeveledSource":
         """`varies` : the measurement matrix varies over the image, and that of its middle is asked about."""
         apart = model.projects_source and len(reader.states) > 1
         return cls(SourceMoments.read(reader, varies) if apart else None, basis)

@@ -4,8 +4,6 @@ Unlike noise it does not average over pixels or captures. One direction is one s
 independent: a value of the train whose standard uncertainty the instrument file states, or what its diagnosis left.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -66,7 +64,7 @@ class Systematic:
         matrix: Callable[[InstrumentModel], tuple[Array, Array]],
         counts: Callable[[InstrumentModel], CountsCorrection | None],
         basis: Array,
-    ) -> Systematic | None:
+    ) -> "Systematic | None":
         """Directions of a model; None where it has none.
 
         Parameters
@@ -126,7 +124,7 @@ class Systematic:
         return out
 
     @classmethod
-    def of_product(cls, product: Product) -> Systematic | None:
+    def of_product(cls, product: Product) -> "Systematic | None":
         """The directions that a Mueller or Stokes product was stored with; None where its instrument has none."""
         if not product.has_array("systematic_turns"):
             return None

@@ -11,8 +11,6 @@ out, with alpha_0 >= 0. It needs triple degeneracy: small eigenvalues that diffe
 spread, or what the residual shows of it, is in the errors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -89,7 +87,7 @@ def fit_values(
     return _fit_correlation(own, rest)
 
 
-def _fit_dominant(model: _Forward, data: Array, covariance: Array, moved: Sequence[Array]) -> MaterialFit:
+def _fit_dominant(model: "_Forward", data: Array, covariance: Array, moved: Sequence[Array]) -> MaterialFit:
     """Fit Mueller matrices (N, 16), whose noise has the covariance (N, 16, 16); `moved` are the same by an instrument
     that is off.
     """
@@ -121,7 +119,7 @@ def _fit_dominant(model: _Forward, data: Array, covariance: Array, moved: Sequen
     )
 
 
-def _root(model: _Forward, start: Array, scaled: Array) -> Array:
+def _root(model: "_Forward", start: Array, scaled: Array) -> Array:
     """Constants near to `start` at which the slope of sum(scaled * m0) is zero."""
     found = start.copy()
     for _ in range(2):
@@ -133,7 +131,7 @@ def _root(model: _Forward, start: Array, scaled: Array) -> Array:
     return found
 
 
-def _slopes(model: _Forward, q: Array, scaled: Array) -> tuple[Array, Array]:
+def _slopes(model: "_Forward", q: Array, scaled: Array) -> tuple[Array, Array]:
     """First (N, 4) and second (N, 4, 4) derivatives of sum(scaled * m0) by the constants, pixel by pixel."""
 
     def overlap(*steps: tuple[int, float]) -> Array:
@@ -196,14 +194,14 @@ class _Correlation:
     What the ideal depolarizer explains is projected out of the data and of the model.
     """
 
-    model: _Forward
+    model: "_Forward"
     rows: Array
     flat: Array
     light: Array
     data: Array
 
     @classmethod
-    def of(cls, model: _Forward, values: Array, rows: Array, whiten: Array) -> _Correlation:
+    def of(cls, model: "_Forward", values: Array, rows: Array, whiten: Array) -> "_Correlation":
         rows, data = whiten @ rows, np.einsum("nij,jn->ni", whiten, values)
         size = np.linalg.norm(rows[:, :, 0], axis=1, keepdims=True)
         flat = rows[:, :, 0] / size

@@ -3,8 +3,6 @@
 Sparse in memory and on disc: a capture of a sphere fills few of the three million bins.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -212,7 +210,7 @@ class ScatteringTable:
         rows = np.where(bins >= 0, self._row[bins], -1)
         return np.where(rows >= 0, self.count[rows], 0) if self.bins.size else np.zeros(rows.shape, dtype=np.int64)
 
-    def merge(self, other: ScatteringTable) -> None:
+    def merge(self, other: "ScatteringTable") -> None:
         """Add all samples of another table of the same quantities, wavelength and layout.
 
         What the inputs of another instrument do is kept apart from what those of this one do.
@@ -319,7 +317,7 @@ class ScatteringTable:
         data.attrs["quantity_name_indices"] = 0
 
     @classmethod
-    def load(cls, path: Path | str) -> ScatteringTable:
+    def load(cls, path: Path | str) -> "ScatteringTable":
         """Read a table. Raises TableError when the file is none, or its axes are not those of its layout."""
         failing = damage_as(TableError, f"{path} cannot be read as a scattering table")
         with failing, open_h5(Path(path), TableError) as h5:

@@ -1,7 +1,5 @@
 """What stands at the centre of the simulated rig: an object, air, a mirror or a diffuser, as a true Mueller image."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,7 +125,7 @@ class Scene:
         self.optics = None if material is None else traced(material)
 
     @classmethod
-    def load(cls, path: Path | str) -> Scene:
+    def load(cls, path: Path | str) -> "Scene":
         """Read a scene file and the material it names. Raises ConfigError with file, line and key."""
         spec = load_yaml(path, _SceneFile).root
         material = None

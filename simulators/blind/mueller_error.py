@@ -1,7 +1,5 @@
 """Error of a reduced Mueller image against the truth, and whether its intervals hold it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -46,7 +44,7 @@ class Reduced:
     lit: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, path: Path, model: InstrumentModel) -> Reduced:
+    def of(cls, path: Path, model: InstrumentModel) -> "Reduced":
         """Reduce a capture as `process reduce` does; `model` as loaded from its file."""
         with TemporaryDirectory() as folder, Capture(path) as capture:
             out = Path(folder) / "mueller.h5"

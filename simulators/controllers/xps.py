@@ -3,8 +3,6 @@
 A move or a homing holds up its own connection until it ends; other connections are answered meanwhile.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -114,7 +112,7 @@ class XPSEmulator(Emulator):
         self.groups = {group.name: group for group in groups}
         self.gathering = Gathering()
 
-    def connect(self) -> XPSConversation:
+    def connect(self) -> "XPSConversation":
         """Begin a conversation."""
         return XPSConversation(self)
 

@@ -1,7 +1,5 @@
 """The `simulator` section of a rig file: emulators, the scene, and the truth that the declared rig may not know."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pydantic import Field
@@ -75,7 +73,7 @@ class SimulatorConfig(Section):
     packet_loss: float = Field(default=0.0, ge=0, lt=1, description="part of the camera's packets that are lost")
     stamp: bool = Field(default=False, description="write the true angles into the pixels, for tests")
 
-    def below(self, folder: Path) -> SimulatorConfig:
+    def below(self, folder: Path) -> "SimulatorConfig":
         """The same with its relative paths made absolute, from `folder`."""
         own_file = self.camera.endswith(".yaml") or is_description(self.camera)
         return self.model_copy(

@@ -1,7 +1,5 @@
 """A rig that is only a record of what the runner asks of it: no devices, no wire, and a clock that jumps."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -29,7 +27,7 @@ BLACK = 100.0
 class RecordedAxis:
     """Stands where it was sent, but for `off_deg`; a degree takes it a hundredth of a second."""
 
-    def __init__(self, rig: RecordedRig, name: str) -> None:
+    def __init__(self, rig: "RecordedRig", name: str) -> None:
         self.rig, self.name = rig, name
         self.config = SimpleNamespace(tolerance_deg=0.01, unit="deg")
         self.deg = self.off_deg = 0.0
@@ -45,7 +43,7 @@ class RecordedAxis:
 class RecordedExposure:
     """Ends `LATE_S` after the exposure time; its frame is what the rig's `picture` gives."""
 
-    def __init__(self, rig: RecordedRig, number: int) -> None:
+    def __init__(self, rig: "RecordedRig", number: int) -> None:
         self.rig, self.number = rig, number
 
     def wait_exposed(self) -> None:

@@ -77,7 +77,7 @@ def test_every_public_function_describes_what_it_takes_and_returns():
             described = re.findall(r"^[\w, ]+", taken[1] if taken else "", re.MULTILINE)
             words = {word.strip() for line in described for word in line.split(",")}
             wrong += [f"{name}: {parameter}" for parameter in signature.parameters if parameter not in words]
-            wrong += [name] if signature.return_annotation != "None" and "Returns\n---" not in text else []
+            wrong += [name] if signature.return_annotation not in (None, "None") and "Returns\n---" not in text else []
     assert wrong == []
 
 

@@ -1,7 +1,5 @@
 """The 2 x 2 super-pixel of a polarization mosaic: which channel sits where."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -41,7 +39,7 @@ class MosaicLayout:
     @classmethod
     def of(
         cls, mosaic: Sequence[Sequence[str]], channels: Sequence[str], analyzers: Array | None = None
-    ) -> MosaicLayout:
+    ) -> "MosaicLayout":
         """From rows of channel names, e.g. (("90", "45"), ("135", "0")), and the rows (channels, 3) of their analyzers.
 
         Raises

@@ -5,8 +5,6 @@ a singular value decomposition of these samples leaves as many fixed matrices as
 pseudo-inverse 3 with one retarder that varies by 16 degrees, 9 with two), and a pixel costs one product with them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -36,7 +34,7 @@ class FieldMatrix:
     polynomials: Array
 
     @classmethod
-    def of(cls, matrix: Callable[[float, float], Array], what: str) -> FieldMatrix:
+    def of(cls, matrix: Callable[[float, float], Array], what: str) -> "FieldMatrix":
         """Interpolate `matrix(y, x)`, y and x from -1 to 1, down and to the right.
 
         Raises

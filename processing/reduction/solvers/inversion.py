@@ -5,8 +5,6 @@ converted to float32 and multiplied by BLAS while it is in the cache; tiles are 
 itself must run one thread (`one_blas_thread`), or its threads and ours fight for the cores.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,7 +44,7 @@ class Inversion:
     @classmethod
     def of(
         cls, w: NDArray[np.float64], what: str = "", basis: NDArray[np.float64] | None = None, spent: float = 0.0
-    ) -> Inversion:
+    ) -> "Inversion":
         """Invert a measurement matrix (N, 16); `basis` (16, R) is what the instrument can determine, default all.
 
         Raises

@@ -4,8 +4,6 @@ The weights come from the plain fit, not from the noisy counts (those would bias
 slope * fitted signal + floor. Saturated intensities have weight 0, in the fit that the weights come from as well.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -39,11 +37,11 @@ class _Matrix:
         self._wt = np.ascontiguousarray(self._solved_w.T)
         self._pairs = np.ascontiguousarray((self._solved_w[:, PACKED_ROW] * self._solved_w[:, PACKED_COLUMN]).T)
 
-    def of(self, pixels: slice) -> _Matrix | _LocalMatrix:
+    def of(self, pixels: slice) -> "_Matrix | _LocalMatrix":
         """That of pixels of the block that was just read."""
         return self
 
-    def some(self, pixels: NDArray[np.int64]) -> _Matrix | _LocalMatrix:
+    def some(self, pixels: NDArray[np.int64]) -> "_Matrix | _LocalMatrix":
         """That of some of its pixels."""
         return self
 
@@ -89,7 +87,7 @@ class _LocalMatrix:
     def __init__(self, w: NDArray[np.float32]) -> None:
         self.w = w
 
-    def some(self, pixels: NDArray[np.int64]) -> _LocalMatrix:
+    def some(self, pixels: NDArray[np.int64]) -> "_LocalMatrix":
         return _LocalMatrix(self.w[:, :, pixels])
 
     def times(self, elements: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,7 +1,5 @@
 """Read states.csv: one row per state, with errors that name line and column."""
 
-from __future__ import annotations
-
 import csv
 import math
 import re
@@ -74,7 +72,7 @@ class StatesFile:
     def __len__(self) -> int:
         return len(self.role)
 
-    def repeated(self, times: int) -> StatesFile:
+    def repeated(self, times: int) -> "StatesFile":
         """Each state so many times, one after the other."""
         if times == 1 or self.files is not None:
             return self

@@ -6,8 +6,6 @@ and put into the file as they are. Of each value only those bytes are deflated t
 are noise, and go into the same stream as they are.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -56,7 +54,7 @@ class Packing:
     deflated: tuple[bool, ...]
 
     @classmethod
-    def of(cls, source: h5py.Dataset, byte_worth: float = BYTE_WORTH) -> Packing:
+    def of(cls, source: h5py.Dataset, byte_worth: float = BYTE_WORTH) -> "Packing":
         """Deflate some strips of a dataset or an array (leading..., rows, columns), byte by byte."""
         itemsize = source.dtype.itemsize
         blocks = [source[(*place, rows)] for place, rows in _samples(source.shape)]

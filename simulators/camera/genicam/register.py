@@ -1,7 +1,5 @@
 """Memory of a played camera, and registers in it as GenICam describes them: bytes, byte order, bit fields."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -36,13 +34,13 @@ class RegisterMemory:
             self._pages.setdefault(page, bytearray(_PAGE))[start : start + part] = data[:part]
             address, data = address + part, data[part:]
 
-    def copy(self) -> RegisterMemory:
+    def copy(self) -> "RegisterMemory":
         """The same bytes, apart from these."""
         other = RegisterMemory()
         other._pages = {page: bytearray(content) for page, content in self._pages.items()}
         return other
 
-    def restore(self, other: RegisterMemory, but: Iterable[tuple[int, int]] = ()) -> None:
+    def restore(self, other: "RegisterMemory", but: Iterable[tuple[int, int]] = ()) -> None:
         """Take the bytes of another memory, except from each first address to before the last one of `but`."""
         kept = [(first, self.read(first, last - first)) for first, last in but]
         self._pages = other.copy()._pages
