@@ -19,6 +19,7 @@ from drivers.errors import (
     ReplyError,
     ReplyTimeout,
 )
+from drivers.serial_link import LineRegistry
 
 __all__ = ["AxisConfig", "AxisIdentity", "Limits", "Motion", "MotionAxis", "Position"]
 
@@ -174,6 +175,8 @@ class MotionAxis(ABC):
     can_stop_a_move: bool = True
     may_move_on_connect: bool = False
     _reads_while_moving: bool = True
+    #: Set by a driver whose controller has a port.
+    _lines: LineRegistry | None = None
 
     def __init__(self, name: str, config: AxisConfig, clock: Clock = REAL) -> None:
         self.name = name
@@ -385,5 +388,7 @@ class MotionAxis(ABC):
     @abstractmethod
     def _do_warnings(self) -> list[str]: ...
 
-    @abstractmethod
-    def _do_close(self) -> None: ...
+    def _do_close(self) -> None:
+        """Give the port back."""
+        if self._lines is not None:
+            self._lines.release(self.config.port)

@@ -201,6 +201,48 @@ def agreed(read: Callable[[], T]) -> T:
     raise ReplyError("read a constant twice", f"readings differ: {seen}", "The line is disturbed: check the cable")
 
 
+class PortConfig(Protocol):
+    """What a rig file says of a port."""
+
+    @property
+    def port(self) -> str: ...
+    @property
+    def held_by(self) -> str | None: ...
+    @property
+    def reply_s(self) -> float | None: ...
+
+
+class ControllerLine:
+    """The port of one controller, shared by its axes.
+
+    Parameters
+    ----------
+    config : of the first axis that is opened.
+    clock, transcript, framer, options : as `SerialLink` takes them.
+    reply_s : longest wait for a reply where the rig file gives none.
+    """
+
+    def __init__(
+        self,
+        config: PortConfig,
+        clock: Clock,
+        transcript: Transcript | None,
+        framer: Framer,
+        *,
+        baudrate: int,
+        reply_s: float,
+        **options: bool,
+    ) -> None:
+        self.link = SerialLink(
+            config.port, baudrate, framer, transcript=transcript, clock=clock, held_by=config.held_by, **options
+        )
+        self.reply_s = config.reply_s or reply_s
+
+    def close(self) -> None:
+        """Close the port."""
+        self.link.close()
+
+
 class Line(Protocol):
     """What a driver keeps for each port: something that can be closed."""
 
@@ -259,6 +301,16 @@ class LineRegistry:
         except BaseException:
             self.release(port)
             raise
+
+    def link(self, config: PortConfig, baudrate: int, framer: Framer) -> contextlib.AbstractContextManager[SerialLink]:
+        """Take the port of a device that has it for itself, as `taken` does."""
+
+        def make(transcript: Transcript | None) -> SerialLink:
+            return SerialLink(
+                config.port, baudrate, framer, transcript=transcript, clock=self.clock, held_by=config.held_by
+            )
+
+        return self.taken(config.port, SerialLink, make)
 
     def release(self, port: str) -> None:
         """Give a line back; the last user closes it."""

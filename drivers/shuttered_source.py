@@ -2,45 +2,43 @@
 
 import contextlib
 from collections.abc import Callable
-from functools import partial
 from typing import Protocol, TypeVar
 
-from drivers.clock import Clock
 from drivers.prompt_line import prompt_framer
-from drivers.serial_link import LineRegistry, SerialLink, Transcript
-from drivers.source import LightSource
+from drivers.serial_link import LineRegistry, SerialLink
+from drivers.source import LightSource, PortSource, SourceConfig
 from drivers.sources import sc10
 
 
-class ShutteredConfig(Protocol):
+class ShutteredConfig(SourceConfig, Protocol):
     """What the rig file says of such a source."""
 
-    @property
-    def port(self) -> str: ...
-    @property
-    def held_by(self) -> str | None: ...
     @property
     def shutter(self) -> sc10.Config | None: ...
 
 
-class ShutteredSource(LightSource):
+class ShutteredSource(PortSource):
     """What the shutter does for the source, where there is one."""
 
-    def __init__(self, port: str, shutter: LightSource | None, lines: LineRegistry) -> None:
-        self._port, self._shutter, self._lines = port, shutter, lines
+    _shutter: LightSource | None
 
     def interlock_open(self) -> bool:
         """That of the shutter; the source alone has none."""
         return self._shutter is not None and self._shutter.interlock_open()
 
-    def _with_shutter(self, found: dict[str, str]) -> dict[str, str]:
+    def describe(self) -> dict[str, str]:
+        """Kind, model and port, what the driver adds, and the model of the shutter."""
+        found = super().describe() | self._facts()
         return found if self._shutter is None else found | {"shutter": self._shutter.describe()["model"]}
+
+    def _facts(self) -> dict[str, str]:
+        return {}
 
     def close(self) -> None:
         """Give the ports back; source and shutter stay as they are."""
         if self._shutter is not None:
             self._shutter.close()
-        self._lines.release(self._port)
+        super().close()
 
 
 Config = TypeVar("Config", bound=ShutteredConfig)
@@ -55,7 +53,7 @@ def open_beside(
 ) -> Source:
     """Open the source, and the shutter where there is one; changes nothing."""
     with (
-        lines.taken(config.port, SerialLink, partial(_link, config, baudrate, lines.clock)) as link,
+        lines.link(config, baudrate, prompt_framer) as link,
         contextlib.ExitStack() as failed,
     ):
         shutter: LightSource | None = None
@@ -65,7 +63,3 @@ def open_beside(
         source = make(config, link, shutter, lines)
         failed.pop_all()
         return source
-
-
-def _link(config: ShutteredConfig, baudrate: int, clock: Clock, transcript: Transcript | None) -> SerialLink:
-    return SerialLink(config.port, baudrate, prompt_framer, transcript=transcript, clock=clock, held_by=config.held_by)

@@ -2,8 +2,10 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
+from typing import Protocol
 
 from drivers.errors import DeviceError
+from drivers.serial_link import LineRegistry, PortConfig
 
 
 def check_wavelengths(places: Mapping[float, int], what: str, others: Iterable[float] = ()) -> None:
@@ -58,9 +60,12 @@ class LightSource(ABC):
     def is_on(self) -> bool:
         """True if light is let through, as read from the device."""
 
-    @abstractmethod
     def interlock_open(self) -> bool:
-        """True if the device's interlock circuit is open; it has shut off the light by itself then."""
+        """True if the device's interlock circuit is open; it has shut off the light by itself then.
+
+        False where it has none that could be read.
+        """
+        return False
 
     @abstractmethod
     def describe(self) -> dict[str, str]:
@@ -103,3 +108,26 @@ class LightSource(ABC):
         raise DeviceError(
             f"light source, set level to {percent:g} %", "it has no level", "Change the exposure or the lamp by hand"
         )
+
+
+class SourceConfig(PortConfig, Protocol):
+    """What a rig file says of a source behind a port."""
+
+    @property
+    def kind(self) -> str: ...
+
+
+class PortSource(LightSource):
+    """A source behind a port of its own; its driver sets what stands here."""
+
+    config: SourceConfig
+    _model: str
+    _lines: LineRegistry
+
+    def describe(self) -> dict[str, str]:
+        """Kind, model and port."""
+        return {"kind": self.config.kind, "model": self._model, "port": self.config.port}
+
+    def close(self) -> None:
+        """Give the port back; the light stays as it is."""
+        self._lines.release(self.config.port)

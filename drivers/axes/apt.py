@@ -20,7 +20,7 @@ from drivers.apt_frames import BAY, RACK, REPLY_NAMES, UNIT, apt_framer, long_me
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed
+from drivers.serial_link import ControllerLine, LineRegistry, Transcript, agreed
 from drivers.unmarked_replies import ask
 
 log = logging.getLogger(__name__)
@@ -81,24 +81,17 @@ class Config(AxisConfig):
         return "" if self.bay is None else f"bay {self.bay}"
 
 
-class APTLine:
+class APTLine(ControllerLine):
     """The port of one APT unit or of a rack."""
 
     def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
-        self.link = SerialLink(
-            config.port, 115_200, apt_framer, transcript=transcript, clock=clock, held_by=config.held_by
-        )
-        self.reply_s = config.reply_s or 0.5
+        super().__init__(config, clock, transcript, apt_framer, baudrate=115_200, reply_s=0.5)
         # The vendor's order of opening: a unit that is not reset so can stay silent.
         self.link.set_rts(True)
         clock.sleep_s(0.05)
         self.link.purge(0.0)
         clock.sleep_s(0.05)
         self.link.set_rts(False)
-
-    def close(self) -> None:
-        """Close the port."""
-        self.link.close()
 
     def ask(self, request: bytes, reply_id: int) -> bytes:
         """Send a request and return the data of the reply with this id; in a rack, of the unit that was asked.
@@ -263,12 +256,8 @@ class APTAxis(MotionAxis):
             words.append("motor current limit reached")
         return words
 
-    def _do_close(self) -> None:
-        self._lines.release(self.config.port)
-
 
 def open(name: str, config: Config, lines: LineRegistry) -> APTAxis:
     """Open one unit; reads its identity, homing parameters and speed and moves nothing."""
-    make = partial(APTLine, config, lines.clock)
-    with lines.taken(config.port, APTLine, make) as line:
+    with lines.taken(config.port, APTLine, partial(APTLine, config, lines.clock)) as line:
         return APTAxis(name, config, line, lines)

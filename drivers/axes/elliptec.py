@@ -17,7 +17,7 @@ from pydantic import Field
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisIdentity
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
+from drivers.serial_link import ControllerLine, LineRegistry, Transcript, agreed, line_framer
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
 
 log = logging.getLogger(__name__)
@@ -60,22 +60,15 @@ class Config(SessionReferenceConfig):
         return f"serial number {self.serial_number}" if self.address is None else f"address {self.address}"
 
 
-class ElliptecLine:
+class ElliptecLine(ControllerLine):
     """Up to 16 modules on one line; replies are sorted by address and letters."""
 
     def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
-        self.link = SerialLink(
-            config.port, 9600, line_framer, transcript=transcript, clock=clock, held_by=config.held_by
-        )
-        self.reply_s = config.reply_s or 0.6
+        super().__init__(config, clock, transcript, line_framer, baudrate=9600, reply_s=0.6)
         # Last message of each module that nobody had asked for: the end of its move.
         self.ended: dict[str, tuple[str, str]] = {}
         self._unanswered_stops: Counter[str] = Counter()
         self._last_sent_s = -float("inf")
-
-    def close(self) -> None:
-        """Close the port."""
-        self.link.close()
 
     def send(self, address: str, command: str) -> None:
         """Write a command; takes no lock."""
@@ -278,12 +271,8 @@ class ElliptecAxis(SessionReferenceAxis):
             words.append(f"model {self._identity.model} is not known here, treated as ELL14")
         return words
 
-    def _do_close(self) -> None:
-        self._lines.release(self.config.port)
-
 
 def open(name: str, config: Config, lines: LineRegistry) -> ElliptecAxis:
     """Open one module; reads its identity and velocity and moves nothing."""
-    make = partial(ElliptecLine, config, lines.clock)
-    with lines.taken(config.port, ElliptecLine, make) as line:
+    with lines.taken(config.port, ElliptecLine, partial(ElliptecLine, config, lines.clock)) as line:
         return ElliptecAxis(name, config, line, lines)

@@ -15,7 +15,7 @@ from drivers.axis_types import stage_limit
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, WrongDevice
 from drivers.motion import AxisIdentity
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
+from drivers.serial_link import ControllerLine, LineRegistry, Transcript, agreed, line_framer
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
 from drivers.unmarked_replies import ask, text_of
 
@@ -56,26 +56,15 @@ class Config(SessionReferenceConfig):
         return f"axis {self.axis}"
 
 
-class ESP301Line:
+class ESP301Line(ControllerLine):
     """The port of one controller, shared by its axes."""
 
     def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
-        self.link = SerialLink(
-            config.port,
-            config.baudrate,
-            line_framer,
-            rtscts=config.rtscts,
-            transcript=transcript,
-            clock=clock,
-            held_by=config.held_by,
+        super().__init__(
+            config, clock, transcript, line_framer, baudrate=config.baudrate, rtscts=config.rtscts, reply_s=2.0
         )
-        self.reply_s = config.reply_s or 2.0
         # The controller has one error memory for all axes, and reading takes out: each axis's own are kept here.
         self._errors: dict[int, list[int]] = {}
-
-    def close(self) -> None:
-        """Close the port."""
-        self.link.close()
 
     def send(self, command: str) -> None:
         """Write a command that answers nothing; takes no lock."""
@@ -204,12 +193,8 @@ class ESP301Axis(SessionReferenceAxis):
             words.append("motor off")
         return words
 
-    def _do_close(self) -> None:
-        self._lines.release(self.config.port)
-
 
 def open(name: str, config: Config, lines: LineRegistry) -> ESP301Axis:
     """Open one axis; reads its identity, limits and speed and moves nothing."""
-    make = partial(ESP301Line, config, lines.clock)
-    with lines.taken(config.port, ESP301Line, make) as line:
+    with lines.taken(config.port, ESP301Line, partial(ESP301Line, config, lines.clock)) as line:
         return ESP301Axis(name, config, line, lines)

@@ -16,7 +16,7 @@ from drivers.axis_types import stage_limit
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
+from drivers.serial_link import ControllerLine, LineRegistry, Transcript, agreed, line_framer
 from drivers.unmarked_replies import ask, text_of
 
 ERRORS = {
@@ -47,18 +47,11 @@ class Config(AxisConfig):
         return f"axis {self.axis}"
 
 
-class GCS2Line:
+class GCS2Line(ControllerLine):
     """The port of one controller, shared by its axes."""
 
     def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
-        self.link = SerialLink(
-            config.port, config.baudrate, line_framer, transcript=transcript, clock=clock, held_by=config.held_by
-        )
-        self.reply_s = config.reply_s or 1.0
-
-    def close(self) -> None:
-        """Close the port."""
-        self.link.close()
+        super().__init__(config, clock, transcript, line_framer, baudrate=config.baudrate, reply_s=1.0)
 
     def send(self, command: str) -> None:
         """Write a command that answers nothing; takes no lock."""
@@ -199,12 +192,8 @@ class GCS2Axis(MotionAxis):
     def _do_warnings(self) -> list[str]:
         return [] if self._number("SVO?") else ["servo off"]
 
-    def _do_close(self) -> None:
-        self._lines.release(self.config.port)
-
 
 def open(name: str, config: Config, lines: LineRegistry) -> GCS2Axis:
     """Open one axis; reads its identity, limits and speed and moves nothing."""
-    make = partial(GCS2Line, config, lines.clock)
-    with lines.taken(config.port, GCS2Line, make) as line:
+    with lines.taken(config.port, GCS2Line, partial(GCS2Line, config, lines.clock)) as line:
         return GCS2Axis(name, config, line, lines)

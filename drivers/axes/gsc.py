@@ -16,7 +16,7 @@ from pydantic import Field
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, WrongDevice
 from drivers.motion import AxisIdentity
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
+from drivers.serial_link import LineRegistry, Transcript, line_framer
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
 from drivers.text_line import TextLine
 
@@ -145,33 +145,22 @@ class GSCAxis(SessionReferenceAxis):
             words.append("stopped at a limit switch")
         return words
 
-    def _do_close(self) -> None:
-        self._lines.release(self.config.port)
-
 
 class GSCLine(TextLine):
     """The port of one controller, for one axis."""
 
+    controller, end, what_to_check = "SHOT controller", "\r\n", "Check power, cable, baud rate and RTS/CTS"
     axis = 0
 
     def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
-        link = SerialLink(
-            config.port,
-            config.baudrate,
-            line_framer,
-            rtscts=config.rtscts,
-            transcript=transcript,
-            clock=clock,
-            held_by=config.held_by,
+        super().__init__(
+            config, clock, transcript, line_framer, baudrate=config.baudrate, reply_s=1.0, rtscts=config.rtscts
         )
-        check = "Check power, cable, baud rate and RTS/CTS"
-        super().__init__(link, "SHOT controller", config.reply_s or 1.0, end="\r\n", what_to_check=check)
 
 
 def open(name: str, config: Config, lines: LineRegistry) -> GSCAxis:
     """Open the axis; asks for firmware and status and moves nothing."""
-    make = partial(GSCLine, config, lines.clock)
-    with lines.taken(config.port, GSCLine, make) as line:
+    with lines.taken(config.port, GSCLine, partial(GSCLine, config, lines.clock)) as line:
         if line.axis not in (0, config.axis):
             raise WrongDevice(
                 f"axis {name} on {config.port} axis {config.axis}",

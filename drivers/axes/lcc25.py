@@ -13,16 +13,14 @@ Unverified on hardware: everything; form of the answers to `mode?` and `enable?`
 import math
 import re
 from collections.abc import Mapping
-from functools import partial
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from drivers.clock import Clock
 from drivers.errors import CommandRejected, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
 from drivers.prompt_line import PromptLine, prompt_framer
-from drivers.serial_link import LineRegistry, SerialLink, Transcript
+from drivers.serial_link import LineRegistry, SerialLink
 
 BAUDRATE = 115200
 HIGHEST_V = 25.0
@@ -122,15 +120,8 @@ class LCC25Axis(MotionAxis):
     def _do_warnings(self) -> list[str]:
         return [] if self._line.ask("enable?", _FLAG) == "1" else ["its output is off"]
 
-    def _do_close(self) -> None:
-        self._lines.release(self.config.port)
-
-
-def _link(config: Config, clock: Clock, transcript: Transcript | None) -> SerialLink:
-    return SerialLink(config.port, BAUDRATE, prompt_framer, transcript=transcript, clock=clock, held_by=config.held_by)
-
 
 def open(name: str, config: Config, lines: LineRegistry) -> LCC25Axis:
     """Open the axis; asks who it is and changes nothing."""
-    with lines.taken(config.port, SerialLink, partial(_link, config, lines.clock)) as link:
+    with lines.link(config, BAUDRATE, prompt_framer) as link:
         return LCC25Axis(name, config, link, lines)

@@ -17,7 +17,7 @@ from pydantic import Field
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, WrongDevice
 from drivers.motion import AxisIdentity
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
+from drivers.serial_link import LineRegistry, Transcript, agreed, line_framer
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
 from drivers.text_line import TextLine
 
@@ -152,19 +152,17 @@ class OWISAxis(SessionReferenceAxis):
             words.append(NOT_READY[state])
         return words
 
-    def _do_close(self) -> None:
-        self._lines.release(self.config.port)
 
+class OWISLine(TextLine):
+    """The port of one unit, shared by its axes."""
 
-def _line(config: Config, clock: Clock, transcript: Transcript | None) -> TextLine:
-    link = SerialLink(
-        config.port, config.baudrate, line_framer, transcript=transcript, clock=clock, held_by=config.held_by
-    )
-    check = "Check power, cable and baud rate"
-    return TextLine(link, "OWIS PS", config.reply_s or 1.0, end="\r", what_to_check=check)
+    controller, end = "OWIS PS", "\r"
+
+    def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
+        super().__init__(config, clock, transcript, line_framer, baudrate=config.baudrate, reply_s=1.0)
 
 
 def open(name: str, config: Config, lines: LineRegistry) -> OWISAxis:
     """Open one axis; asks for version and states and moves nothing."""
-    with lines.taken(config.port, TextLine, partial(_line, config, lines.clock)) as line:
+    with lines.taken(config.port, OWISLine, partial(OWISLine, config, lines.clock)) as line:
         return OWISAxis(name, config, line, lines)

@@ -14,7 +14,7 @@ from pydantic import Field
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, DeviceError, NotHomedError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
+from drivers.serial_link import ControllerLine, LineRegistry, Transcript, agreed, line_framer
 from drivers.unmarked_replies import ask
 
 ERRORS = {
@@ -87,24 +87,11 @@ class Config(AxisConfig):
         return f"address {self.address}"
 
 
-class SMC100Line:
+class SMC100Line(ControllerLine):
     """One line of controllers; replies are matched by address and command letters."""
 
     def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
-        self.link = SerialLink(
-            config.port,
-            config.baudrate,
-            line_framer,
-            xonxoff=True,
-            transcript=transcript,
-            clock=clock,
-            held_by=config.held_by,
-        )
-        self.reply_s = config.reply_s or 0.5
-
-    def close(self) -> None:
-        """Close the port."""
-        self.link.close()
+        super().__init__(config, clock, transcript, line_framer, baudrate=config.baudrate, xonxoff=True, reply_s=0.5)
 
     def send(self, address: int, command: str) -> None:
         """Write a command that answers nothing; takes no lock."""
@@ -278,12 +265,8 @@ class SMC100Axis(MotionAxis):
             words.append(f"model {self._identity.model} is not known here, treated as SMC100")
         return words
 
-    def _do_close(self) -> None:
-        self._lines.release(self.config.port)
-
 
 def open(name: str, config: Config, lines: LineRegistry) -> SMC100Axis:
     """Open one axis; reads its identity, limits and speed and moves nothing."""
-    make = partial(SMC100Line, config, lines.clock)
-    with lines.taken(config.port, SMC100Line, make) as line:
+    with lines.taken(config.port, SMC100Line, partial(SMC100Line, config, lines.clock)) as line:
         return SMC100Axis(name, config, line, lines)

@@ -18,7 +18,7 @@ from pydantic import Field
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisIdentity
-from drivers.serial_link import LineRegistry, SerialLink, Transcript
+from drivers.serial_link import ControllerLine, LineRegistry, Transcript
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
 from drivers.standa_frames import ERRORS, LAYOUTS, RESYNCHRONIZE, WRONG_VALUE, framer, message
 
@@ -61,24 +61,11 @@ class Config(SessionReferenceConfig):
     )
 
 
-class StandaLine:
+class StandaLine(ControllerLine):
     """The port of one controller."""
 
     def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
-        self.link = SerialLink(
-            config.port,
-            115_200,
-            framer,
-            two_stop_bits=True,
-            transcript=transcript,
-            clock=clock,
-            held_by=config.held_by,
-        )
-        self.reply_s = config.reply_s or 0.5
-
-    def close(self) -> None:
-        """Close the port."""
-        self.link.close()
+        super().__init__(config, clock, transcript, framer, baudrate=115_200, two_stop_bits=True, reply_s=0.5)
 
     def ask(self, letters: bytes) -> tuple[Any, ...]:
         """Ask a question and return the values of the answer; once more if none came.
@@ -260,9 +247,6 @@ class StandaAxis(SessionReferenceAxis):
     def _do_warnings(self) -> list[str]:
         return self._reference_warnings() + _words(self._status().flags & ~FAULTS)
 
-    def _do_close(self) -> None:
-        self._lines.release(self.config.port)
-
 
 def _words(flags: int) -> list[str]:
     return [words for bit, words in CONDITIONS.items() if flags & bit]
@@ -270,6 +254,5 @@ def _words(flags: int) -> list[str]:
 
 def open(name: str, config: Config, lines: LineRegistry) -> StandaAxis:
     """Open one axis; reads identity, speeds and borders and moves nothing."""
-    make = partial(StandaLine, config, lines.clock)
-    with lines.taken(config.port, StandaLine, make) as line:
+    with lines.taken(config.port, StandaLine, partial(StandaLine, config, lines.clock)) as line:
         return StandaAxis(name, config, line, lines)

@@ -20,7 +20,7 @@ from drivers.axis_types import stage_limit
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, LimitError, NotHomedError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed
+from drivers.serial_link import ControllerLine, LineRegistry, SerialLink, Transcript, agreed
 from drivers.unmarked_replies import ask, text_of
 
 END = b",EndOfAPI"
@@ -63,16 +63,11 @@ def framer(buffer: bytearray) -> bytes | None:
     return frame
 
 
-class XPSLine:
+class XPSLine(ControllerLine):
     """The connection for questions, shared by the axes of one controller."""
 
     def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
-        self.link = SerialLink(config.port, 9600, framer, transcript=transcript, clock=clock, held_by=config.held_by)
-        self.reply_s = config.reply_s or 1.0
-
-    def close(self) -> None:
-        """Close the connection."""
-        self.link.close()
+        super().__init__(config, clock, transcript, framer, baudrate=9600, reply_s=1.0)
 
     def ask(self, call: str, form: str) -> str:
         """Ask a question; returns the values of the answer, in the given form.
@@ -289,7 +284,7 @@ class XPSAxis(MotionAxis):
     def _do_close(self) -> None:
         self._moving.close()
         self._stopping.close()
-        self._lines.release(self.config.port)
+        super()._do_close()
 
 
 def open(name: str, config: Config, lines: LineRegistry) -> XPSAxis:

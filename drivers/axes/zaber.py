@@ -16,7 +16,7 @@ from pydantic import Field
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
+from drivers.serial_link import ControllerLine, LineRegistry, Transcript, agreed, line_framer
 
 VELOCITY_UNIT = 1.6384  # native velocity per microstep/s (unverified)
 ACCELERATION_UNIT = 1.6384 / 10_000  # native acceleration per microstep/s^2 (unverified)
@@ -106,22 +106,15 @@ def parse_reply(frame: bytes) -> Reply | None:
     return Reply(*numbers, match[4] == "OK", match[5] == "BUSY", match[6], match[7], summed)
 
 
-class ZaberLine:
+class ZaberLine(ControllerLine):
     """One chain of devices: sends commands, gives each reply to its request by address, axis and id."""
 
     def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
-        self.link = SerialLink(
-            config.port, config.baudrate, line_framer, transcript=transcript, clock=clock, held_by=config.held_by
-        )
-        self.reply_s = config.reply_s or 0.5
+        super().__init__(config, clock, transcript, line_framer, baudrate=config.baudrate, reply_s=0.5)
         # A stop from another thread takes an id at the same time: never the same one.
         self._message_ids = itertools.cycle(range(1, 100))
         # Devices set to answer without checksums (`comm.checksum` 0). From others such a reply is a damaged one.
         self._unsummed: set[int] = set()
-
-    def close(self) -> None:
-        """Close the port."""
-        self.link.close()
 
     def send(self, address: int, axis: int, words: str) -> int:
         """Write a command and return its message id; takes no lock."""
@@ -318,12 +311,8 @@ class ZaberAxis(MotionAxis):
     def _do_warnings(self) -> list[str]:
         return [f"{flag} {FLAGS.get(flag, 'unknown flag')}" for flag in self._flags()]
 
-    def _do_close(self) -> None:
-        self._lines.release(self.config.port)
-
 
 def open(name: str, config: Config, lines: LineRegistry) -> ZaberAxis:
     """Open one axis; reads its identity, limits and speed and moves nothing."""
-    make = partial(ZaberLine, config, lines.clock)
-    with lines.taken(config.port, ZaberLine, make) as line:
+    with lines.taken(config.port, ZaberLine, partial(ZaberLine, config, lines.clock)) as line:
         return ZaberAxis(name, config, line, lines)

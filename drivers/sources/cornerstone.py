@@ -10,15 +10,13 @@ query waits for the end of a move.
 """
 
 import re
-from functools import partial
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from drivers.clock import Clock
 from drivers.errors import CommandRejected, DeviceError, WrongDevice
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
-from drivers.source import LightSource
+from drivers.serial_link import LineRegistry, SerialLink, agreed, line_framer
+from drivers.source import PortSource
 from drivers.unmarked_replies import ask, text_of
 
 ERRORS = {1: "command not understood", 2: "bad parameter", 3: "destination not allowed", 8: "cannot home the drive"}
@@ -44,13 +42,14 @@ class Config(BaseModel):
     move_s: float = Field(default=30.0, gt=0, description="longest time for the gratings and the shutter to move")
 
 
-class Monochromator(LightSource):
+class Monochromator(PortSource):
     """A monochromator behind a lamp."""
 
     selects_wavelength = True
 
     def __init__(self, config: Config, link: SerialLink, lines: LineRegistry) -> None:
-        self.config, self._link, self._lines = config, link, lines
+        self.config: Config = config
+        self._link, self._lines = link, lines
         self._name = f"monochromator on {config.port}"
         self._model = self._ask("INFO?", _INFO)
         if not re.search(r"cornerstone|oriel|CS\d{3}|\b74\d{3}", self._model, re.IGNORECASE):
@@ -103,26 +102,8 @@ class Monochromator(LightSource):
             raise DeviceError(f"{self._name}, SHUTTER?", "two readings differ", "Check the cable")
         return answers[0] == "O"
 
-    def interlock_open(self) -> bool:
-        """False: it has no interlock that could be read."""
-        return False
-
-    def describe(self) -> dict[str, str]:
-        """Kind, model and port."""
-        return {"kind": self.config.kind, "model": self._model, "port": self.config.port}
-
-    def close(self) -> None:
-        """Give the port back; wavelength and shutter stay as they are."""
-        self._lines.release(self.config.port)
-
 
 def open(config: Config, lines: LineRegistry) -> Monochromator:
     """Open the monochromator; asks who it is and changes nothing."""
-    with lines.taken(config.port, SerialLink, partial(_link, config, lines.clock)) as link:
+    with lines.link(config, config.baudrate, line_framer) as link:
         return Monochromator(config, link, lines)
-
-
-def _link(config: Config, clock: Clock, transcript: Transcript | None) -> SerialLink:
-    return SerialLink(
-        config.port, config.baudrate, line_framer, transcript=transcript, clock=clock, held_by=config.held_by
-    )

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from drivers.errors import CommandRejected, DeviceError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.message_device import MessageDevice
 from drivers.serial_link import LineRegistry
-from drivers.source import LightSource, check_wavelengths
+from drivers.source import PortSource, check_wavelengths
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _STATE = re.compile(r"0|1|ON|OFF", re.IGNORECASE)
@@ -46,14 +46,14 @@ class Config(BaseModel):
         return self
 
 
-class Dc2200(LightSource):
+class Dc2200(PortSource):
     """A DC2200 in constant-brightness mode; at most one LED is on after a call of `select` or `set_light`."""
 
     selects_wavelength = True
     has_level = True
 
     def __init__(self, config: Config, device: MessageDevice, lines: LineRegistry) -> None:
-        self.config = config
+        self.config: Config = config
         self._device, self._lines = device, lines
         self._name = f"LED driver on {config.port}"
         maker, self._model, self._serial_number, self._firmware = self._ask("*IDN?", _IDENTITY).split(",")
@@ -113,10 +113,6 @@ class Dc2200(LightSource):
             raise CommandRejected(asked, f"it reads back {back:g} %", "Look at the box and its LED")
         return back
 
-    def interlock_open(self) -> bool:
-        """False: the box has no interlock input."""
-        return False
-
     def describe(self) -> dict[str, str]:
         """Kind, model, serial number, firmware and port."""
         return {
@@ -126,10 +122,6 @@ class Dc2200(LightSource):
             "firmware": self._firmware.strip(),
             "port": self.config.port,
         }
-
-    def close(self) -> None:
-        """Give the port back; the light stays as it is."""
-        self._lines.release(self.config.port)
 
     def _switch(self, terminal: int, on: bool) -> None:
         asked = f"{self._name}, LED {terminal} {'on' if on else 'off'}"
@@ -180,9 +172,7 @@ class Dc2200(LightSource):
 
 def open(config: Config, lines: LineRegistry) -> Dc2200:
     """Open the LED driver; asks who it is and changes nothing."""
-    device = lines.take(config.port, MessageDevice, lambda _: MessageDevice(config.port, lines.clock, config.held_by))
-    try:
+    with lines.taken(
+        config.port, MessageDevice, lambda _: MessageDevice(config.port, lines.clock, config.held_by)
+    ) as device:
         return Dc2200(config, device, lines)
-    except BaseException:
-        lines.release(config.port)
-        raise

@@ -16,10 +16,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from drivers.clock import Clock
 from drivers.errors import CommandRejected, DeviceError, ReplyError, WrongDevice
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
-from drivers.source import LightSource, check_wavelengths
+from drivers.serial_link import LineRegistry, SerialLink, agreed, line_framer
+from drivers.source import PortSource, check_wavelengths
 from drivers.unmarked_replies import ask, text_of
 
 BAUDRATE = 115200
@@ -65,14 +64,14 @@ class Config(BaseModel):
         return self
 
 
-class Dc4100(LightSource):
+class Dc4100(PortSource):
     """A DC4100 or DC4104. At most one LED is on after a call of `select` or `set_light`."""
 
     selects_wavelength = True
     has_level = True
 
     def __init__(self, config: Config, link: SerialLink, lines: LineRegistry) -> None:
-        self.config = config
+        self.config: Config = config
         self._link, self._lines = link, lines
         self._model, self._serial_number, self._firmware = (
             agreed(partial(self._ask, query)) for query in ("N?", "S?", "V?")
@@ -153,10 +152,6 @@ class Dc4100(LightSource):
             raise self._refused(asked, f"it reads back {back:g} %")
         return back
 
-    def interlock_open(self) -> bool:
-        """False: the box has no interlock input."""
-        return False
-
     def describe(self) -> dict[str, str]:
         """Kind, model, serial number, firmware, port, and the LEDs by channel with their nominal wavelengths."""
         leds = ", ".join(f"{channel + 1}: {nm:g} nm" for channel, nm in self._nominal_nm.items())
@@ -168,10 +163,6 @@ class Dc4100(LightSource):
             "port": self.config.port,
             "leds": leds,
         }
-
-    def close(self) -> None:
-        """Give the port back; the light stays as it is."""
-        self._lines.release(self.config.port)
 
     # --- channels ----------------------------------------------------------------------------------------
 
@@ -254,13 +245,5 @@ class Dc4100(LightSource):
 
 def open(config: Config, lines: LineRegistry) -> Dc4100:
     """Open the LED driver; asks who it is and what it drives, and changes nothing."""
-    link = lines.take(config.port, SerialLink, lambda transcript: _link(config, transcript, lines.clock))
-    try:
+    with lines.link(config, BAUDRATE, line_framer) as link:
         return Dc4100(config, link, lines)
-    except BaseException:
-        lines.release(config.port)
-        raise
-
-
-def _link(config: Config, transcript: Transcript | None, clock: Clock) -> SerialLink:
-    return SerialLink(config.port, BAUDRATE, line_framer, transcript=transcript, clock=clock, held_by=config.held_by)

@@ -54,8 +54,8 @@ class FilterWheel(ShutteredSource):
     selects_wavelength = True
 
     def __init__(self, config: Config, link: SerialLink, shutter: LightSource | None, lines: LineRegistry) -> None:
-        super().__init__(config.port, shutter, lines)
-        self.config = config
+        self.config: Config = config
+        self._shutter, self._lines = shutter, lines
         self._name = f"filter wheel on {config.port}"
         self._line = PromptLine(link, self._name, config.reply_s)
         self._model = self._line.ask("*idn?")
@@ -103,11 +103,9 @@ class FilterWheel(ShutteredSource):
             return self._shutter.is_on()
         return self._line.ask_number("pos?") != self.config.dark_position
 
-    def describe(self) -> dict[str, str]:
-        """Kind, model, port, and the filters by position."""
+    def _facts(self) -> dict[str, str]:
         filters = ", ".join(f"{position}: {nm:g} nm" for nm, position in self.config.positions.items())
-        found = {"kind": self.config.kind, "model": self._model, "port": self.config.port, "filters": filters}
-        return self._with_shutter(found)
+        return {"filters": filters}
 
     def _turn(self, position: int) -> None:
         if self._line.ask_number("pos?") == position:

@@ -7,15 +7,13 @@ watchdog has run out the outputs stand at their safe value, which is off as deli
 answered with ``!`` and ignored.
 """
 
-from functools import partial
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from drivers.clock import Clock
 from drivers.errors import CommandRejected, DeviceError, ReplyError, ReplyTimeout, WrongDevice
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
-from drivers.source import LightSource
+from drivers.serial_link import LineRegistry, SerialLink, line_framer
+from drivers.source import PortSource
 
 BAUDRATE = 9600
 
@@ -36,11 +34,11 @@ class Config(BaseModel):
     reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
 
 
-class RelayModule(LightSource):
+class RelayModule(PortSource):
     """Light passes while the relay is closed."""
 
     def __init__(self, config: Config, link: SerialLink, lines: LineRegistry) -> None:
-        self.config = config
+        self.config: Config = config
         self._link, self._lines = link, lines
         self._name = f"relay module {config.address:02X} on {config.port}"
         self._model = self._ask("$", "M")
@@ -78,18 +76,6 @@ class RelayModule(LightSource):
         except ValueError:
             raise self._disturbed("read the outputs", reply) from None
 
-    def interlock_open(self) -> bool:
-        """False: it has no interlock that could be read."""
-        return False
-
-    def describe(self) -> dict[str, str]:
-        """Kind, model and port."""
-        return {"kind": self.config.kind, "model": self._model, "port": self.config.port}
-
-    def close(self) -> None:
-        """Give the port back; the relay opens when the watchdog runs out."""
-        self._lines.release(self.config.port)
-
     def _ask(self, lead: str, command: str, *, addressed: bool = True) -> str:
         """What a reply ``!AA...`` holds; an unusable reply is asked for once more."""
         start = f"!{self.config.address:02X}" if addressed else "!"
@@ -120,9 +106,5 @@ class RelayModule(LightSource):
 
 def open(config: Config, lines: LineRegistry) -> RelayModule:
     """Open the module; asks who it is and changes nothing."""
-    with lines.taken(config.port, SerialLink, partial(_link, config, lines.clock)) as link:
+    with lines.link(config, BAUDRATE, line_framer) as link:
         return RelayModule(config, link, lines)
-
-
-def _link(config: Config, clock: Clock, transcript: Transcript | None) -> SerialLink:
-    return SerialLink(config.port, BAUDRATE, line_framer, transcript=transcript, clock=clock, held_by=config.held_by)

@@ -49,8 +49,8 @@ class TunableFilter(ShutteredSource):
     selects_wavelength = True
 
     def __init__(self, config: Config, link: SerialLink, shutter: LightSource | None, lines: LineRegistry) -> None:
-        super().__init__(config.port, shutter, lines)
-        self.config, self._link = config, link
+        self.config: Config = config
+        self._link, self._shutter, self._lines = link, shutter, lines
         self._name = f"tunable filter on {config.port}"
         self._line = PromptLine(link, self._name, config.reply_s, echo=False)
         self._model = self._line.ask("*idn?")
@@ -113,10 +113,8 @@ class TunableFilter(ShutteredSource):
         open_ = self._shutter is None or self._shutter.is_on()
         return open_ and self._value("BW") != BLACK
 
-    def describe(self) -> dict[str, str]:
-        """Kind, model, port and band."""
-        found = {"kind": self.config.kind, "model": self._model, "port": self.config.port, "band": self.config.band}
-        return self._with_shutter(found)
+    def _facts(self) -> dict[str, str]:
+        return {"band": self.config.band}
 
 
 def open(config: Config, lines: LineRegistry) -> TunableFilter:

@@ -65,10 +65,6 @@ class ManualSource(LightSource):
         """What the operator confirmed last; True before any question."""
         return self._on
 
-    def interlock_open(self) -> bool:
-        """False: it has no interlock that could be read."""
-        return False
-
     def describe(self) -> dict[str, str]:
         """Kind, and that nothing of it can be read."""
         return {"kind": "manual", "model": "switched by the operator", "port": "none"}

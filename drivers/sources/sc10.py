@@ -5,16 +5,14 @@ reads the blade, `interlock?` is 1 while the interlock circuit is open (Thorlabs
 12 and 13; not yet tried on the real box).
 """
 
-from functools import partial
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from drivers.clock import Clock
 from drivers.errors import CommandRejected, DeviceError, WrongDevice
 from drivers.prompt_line import PromptLine, prompt_framer
-from drivers.serial_link import LineRegistry, SerialLink, Transcript
-from drivers.source import LightSource
+from drivers.serial_link import LineRegistry, SerialLink
+from drivers.source import PortSource
 
 BAUDRATE = 9600
 
@@ -31,11 +29,11 @@ class Config(BaseModel):
     blade_s: float = Field(default=1.0, gt=0, description="longest time for the blade to open or close")
 
 
-class Shutter(LightSource):
+class Shutter(PortSource):
     """SC10 in manual mode: light is on while the shutter is enabled."""
 
     def __init__(self, config: Config, link: SerialLink, lines: LineRegistry) -> None:
-        self.config = config
+        self.config: Config = config
         self._link, self._lines = link, lines
         self._line = PromptLine(link, f"shutter on {config.port}", config.reply_s)
         self._model = self._line.ask("id?")
@@ -71,23 +69,11 @@ class Shutter(LightSource):
         """True if the interlock circuit is open."""
         return self._flag("interlock?")
 
-    def describe(self) -> dict[str, str]:
-        """Kind, model and port."""
-        return {"kind": self.config.kind, "model": self._model, "port": self.config.port}
-
-    def close(self) -> None:
-        """Give the port back."""
-        self._lines.release(self.config.port)
-
     def _flag(self, query: str) -> bool:
         return self._line.ask_number(query) != 0
 
 
 def open(config: Config, lines: LineRegistry) -> Shutter:
     """Open the shutter; sends one `id?` and changes nothing."""
-    with lines.taken(config.port, SerialLink, partial(_link, config, lines.clock)) as link:
+    with lines.link(config, BAUDRATE, prompt_framer) as link:
         return Shutter(config, link, lines)
-
-
-def _link(config: Config, clock: Clock, transcript: Transcript | None) -> SerialLink:
-    return SerialLink(config.port, BAUDRATE, prompt_framer, transcript=transcript, clock=clock, held_by=config.held_by)

@@ -28,6 +28,7 @@ class CornerstoneEmulator(Emulator):
     wavelength_nm, shutter : where the gratings stand, and C or O.
     """
 
+    foreign = b"UNITS?\r\nNM\r\n"
     pieces = (b"GOWAVE ", b"SHUTTER ", b"WAVE?\n", b"ERROR?\n", b"\n")
 
     def __init__(self, clock: FastClock, faults: FaultSchedule | None = None, echo: bool = True) -> None:
@@ -91,9 +92,6 @@ class CornerstoneEmulator(Emulator):
     def _take_status(self) -> str:
         status, self._status = self._status, 0
         return f"{status:02d}"
-
-    def _do_make_foreign(self, reply: bytes) -> bytes:
-        return b"UNITS?\r\nNM\r\n"
 
 
 def make(options: ServeOptions) -> CornerstoneEmulator:

@@ -17,6 +17,8 @@ _LED = re.compile(r"(OUTP|SOUR)(?:UT|CE)?([12])?:(.*)")
 class DC2200Emulator(Emulator):
     """The LED driver box with an LED at each terminal, wavelengths in nm."""
 
+    foreign = b"THORLABS,ITC4020,E12345678,1.4.0/2.0.3/1.6.0\n"
+
     def __init__(
         self,
         clock: FastClock,
@@ -88,9 +90,6 @@ class DC2200Emulator(Emulator):
         else:
             self._error = _RANGE
         return ""
-
-    def _do_make_foreign(self, reply: bytes) -> bytes:
-        return b"THORLABS,ITC4020,E12345678,1.4.0/2.0.3/1.6.0\n"
 
 
 def make(options: ServeOptions) -> DC2200Emulator:

@@ -31,6 +31,8 @@ class DC4100Emulator(Emulator):
         Set by `overheat`; no LED can be on then.
     """
 
+    foreign = b"M00223344\r\n"
+
     def __init__(
         self,
         clock: FastClock,
@@ -157,9 +159,6 @@ class DC4100Emulator(Emulator):
 
     def _channel(self, word: str) -> int | None:
         return int(word) if word in ("0", "1", "2", "3") else None
-
-    def _do_make_foreign(self, reply: bytes) -> bytes:
-        return b"M00223344\r\n"
 
 
 def make(options: ServeOptions) -> DC4100Emulator:

@@ -60,6 +60,8 @@ class ESPAxis:
 class ESP301Emulator(Emulator):
     """A controller with up to three axes; `true_deg(i)` belongs to axis i + 1."""
 
+    # Replies carry no address at all: the answer to another question is all that can be wrong.
+    foreign = b"ESP301 Version 3.0.1 6/1/99\r\n"
     pieces = (b"1PA", b"1OR1", b"1MO", b"TB?", b"1DH", b"1SL", b";", b"\r", b"AB", b"2TP?")
 
     def __init__(self, stages: Sequence[ESPAxis], clock: FastClock, faults: FaultSchedule | None = None) -> None:
@@ -269,10 +271,6 @@ class ESP301Emulator(Emulator):
         self._wait_for = stage
         extra_s = _number(value) / 1000 if value else 0.0
         self._go_on_s = max(stage.axis.end_s(), self.clock.now_s()) + extra_s
-
-    def _do_make_foreign(self, reply: bytes) -> bytes:
-        # Replies carry no address at all: the answer to another question is all that can be wrong.
-        return b"ESP301 Version 3.0.1 6/1/99\r\n"
 
 
 def _number(value: str) -> float:

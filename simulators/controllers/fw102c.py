@@ -22,6 +22,8 @@ class FW102CEmulator(Emulator):
         Simulated time from one position to the next.
     """
 
+    foreign = b"closed?\r1\r" + PROMPT
+
     def __init__(self, clock: FastClock, faults: FaultSchedule | None = None, step_s: float = 0.5) -> None:
         super().__init__([], clock, faults)
         self.step_s = step_s
@@ -85,9 +87,6 @@ class FW102CEmulator(Emulator):
 
     def _do_next_event_s(self) -> float | None:
         return None if self._due is None else self._arrives_s
-
-    def _do_make_foreign(self, reply: bytes) -> bytes:
-        return b"closed?\r1\r" + PROMPT
 
 
 def make(options: ServeOptions) -> FW102CEmulator:

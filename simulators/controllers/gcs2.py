@@ -44,6 +44,8 @@ class Stage:
 class GCS2Emulator(Emulator):
     """A controller with axes 1, 2, ...; `true_deg(i)` belongs to axis i + 1."""
 
+    # The answer for another axis; a number without an axis is all that other questions get.
+    foreign = b"9=77.0000\n"
     pieces = (
         b"MOV 1 ",
         b"FRF",
@@ -182,10 +184,6 @@ class GCS2Emulator(Emulator):
         if value <= 0:
             raise Gcs2Error(OUT_OF_LIMITS)
         stage.axis.speed_deg_s = value
-
-    def _do_make_foreign(self, reply: bytes) -> bytes:
-        # The answer for another axis; a number without an axis is all that other questions get.
-        return b"9=77.0000\n"
 
 
 def _lines(lines: Iterable[str]) -> str:

@@ -28,6 +28,8 @@ LONGEST_RAMP_MS = 1000
 class GSCEmulator(Emulator):
     """A controller with one or two stages."""
 
+    # The answer to another question: the state of an input that nobody asked for.
+    foreign = b"I:4\r\n"
     pieces = (b"Q:\r\n", b"\r\nQ:\r\n", b"M:1+P", b"A:1-P", b"G:", b"H:1", b"L:", b"!:\r\n", b"?:V", b"J:1+", b"\r\n")
     tells_limits = False
 
@@ -164,10 +166,6 @@ class GSCEmulator(Emulator):
                 self.axes[index].stop()
         self._next = {}
         return bool(chosen)
-
-    def _do_make_foreign(self, reply: bytes) -> bytes:
-        # The answer to another question: the state of an input that nobody asked for.
-        return b"I:4\r\n"
 
 
 def _make(axes: int, options: ServeOptions) -> GSCEmulator:

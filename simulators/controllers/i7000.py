@@ -13,6 +13,8 @@ RUN_OUT = 0x04
 class I7060Emulator(Emulator):
     """The module at address 01, all relays open; light passes while relay 0 is closed."""
 
+    foreign = b"!027060\r"
+
     def __init__(self, clock: FastClock, faults: FaultSchedule | None = None) -> None:
         super().__init__([], clock, faults)
         self._outputs = 0
@@ -72,9 +74,6 @@ class I7060Emulator(Emulator):
             return "!"
         self._outputs = self._outputs | 1 << output if on else self._outputs & ~(1 << output)
         return ">"
-
-    def _do_make_foreign(self, reply: bytes) -> bytes:
-        return b"!027060\r"
 
 
 def make(options: ServeOptions) -> I7060Emulator:

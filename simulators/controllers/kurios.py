@@ -24,6 +24,8 @@ class KuriosEmulator(Emulator):
         Mode of output, wavelength in nm, band, status, temperature and features, by keyword.
     """
 
+    foreign = b"SS=0\r>"
+
     def __init__(self, clock: FastClock, faults: FaultSchedule | None = None) -> None:
         super().__init__([], clock, faults)
         self.values: dict[str, float] = {"OM": 1, "WL": 550.0, "BW": BLACK, "ST": READY, "TP": 31.2, "OH": 271}
@@ -62,9 +64,6 @@ class KuriosEmulator(Emulator):
             return "CMD_ARG_INVALID"
         self.values[name] = value
         return ""
-
-    def _do_make_foreign(self, reply: bytes) -> bytes:
-        return b"SS=0\r>"
 
 
 def make(options: ServeOptions) -> KuriosEmulator:

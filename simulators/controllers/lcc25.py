@@ -36,6 +36,7 @@ class LCC25Emulator(Emulator):
         Of all settings, by keyword.
     """
 
+    foreign = b"freq?\r60.0\r" + PROMPT
     pieces = (b"volt1=", b"mode=", b"enable=", b"\r")
 
     def __init__(self, axis: EmulatedAxis, clock: FastClock, faults: FaultSchedule | None = None) -> None:
@@ -66,9 +67,6 @@ class LCC25Emulator(Emulator):
         if wanted != self.axes[0].position_deg():
             self.axes[0].move_to(wanted)
         return ""
-
-    def _do_make_foreign(self, reply: bytes) -> bytes:
-        return b"freq?\r60.0\r" + PROMPT
 
 
 def make(options: ServeOptions) -> LCC25Emulator:

@@ -18,6 +18,8 @@ _QUESTION = re.compile(r"\?([A-Z]+)([1-9])?")
 class OWISEmulator(Emulator):
     """One unit; `true_deg(i)` belongs to the i-th axis."""
 
+    # The answer to another question.
+    foreign = b"00 NO ERROR\r"
     pieces = (
         *(b"?ASTAT\r", b"\r?ASTAT\r", b"?CNT1\r", b"PSET1=", b"PGO1\r", b"REF1=4\r", b"STOP1\r"),
         *(b"INIT1\r", b"MOFF1\r", b"RELAT1\r", b"ABSOL1\r", b"\r"),
@@ -101,10 +103,6 @@ class OWISEmulator(Emulator):
         counts = self._targets[index] + (self._counts(index) if self._relative[index] else 0)
         if self.axes[index].within(counts / COUNTS_PER_DEG):
             self.axes[index].move_to(counts / COUNTS_PER_DEG)
-
-    def _do_make_foreign(self, reply: bytes) -> bytes:
-        # The answer to another question.
-        return b"00 NO ERROR\r"
 
 
 def make(options: ServeOptions) -> OWISEmulator:

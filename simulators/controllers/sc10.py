@@ -20,6 +20,8 @@ class SC10Emulator(Emulator):
         Simulated time that the blade takes.
     """
 
+    foreign = b"closed?\r1\r" + PROMPT
+
     def __init__(self, clock: FastClock, faults: FaultSchedule | None = None, blade_s: float = 0.01) -> None:
         super().__init__([], clock, faults)
         self.blade_s = blade_s
@@ -100,9 +102,6 @@ class SC10Emulator(Emulator):
             self._numbers[setting[1]] = int(setting[2])
             return ""
         return "Command error CMD_NOT_DEFINED"
-
-    def _do_make_foreign(self, reply: bytes) -> bytes:
-        return b"closed?\r1\r" + PROMPT
 
 
 def make(options: ServeOptions) -> SC10Emulator:

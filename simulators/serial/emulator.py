@@ -191,9 +191,12 @@ class Emulator(ABC):
         Pieces of real commands: with them the noise of the conformance tests gets past the first letter.
     tells_limits : bool
         False where the controller does not tell the limits of its travel.
+    foreign : bytes
+        A reply to another question, or of another device.
     """
 
     pieces: Sequence[bytes] = ()
+    foreign: bytes = b""
     tells_limits: bool = True
 
     def __init__(self, axes: Sequence[EmulatedAxis], clock: FastClock, faults: FaultSchedule | None = None) -> None:
@@ -264,9 +267,9 @@ class Emulator(ABC):
     def _do_receive(self, data: bytes) -> None:
         """Split bytes into commands, call `_apply_faults` for each, and `_reply`."""
 
-    @abstractmethod
     def _do_make_foreign(self, reply: bytes) -> bytes:
         """Make of a reply one that belongs to another device or request."""
+        return self.foreign
 
     def _do_advance(self) -> None:  # noqa: B027 - most protocols have nothing to do here
         """Send what became due with time."""
