@@ -8,10 +8,10 @@ import pytest
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import held_out, minimize
 from processing.diagnosis.search.space import Space, Sums
-from processing.geometry.frames import ScatteringGeometry, change_frames
 from processing.polarization import mueller
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import reflectance_effects
+from tests.measured.ptfe import in_facet_axes
 
 pytestmark = pytest.mark.measured
 
@@ -98,24 +98,12 @@ class ReflectanceProblem:
         return out
 
 
-def direction(theta_deg, phi_deg):
-    t, p = np.deg2rad(theta_deg), np.deg2rad(phi_deg)
-    return np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], axis=-1)
-
-
 def problem_of(public_files, wavelength_um):
     rows = np.genfromtxt(public_files("ptfe-mueller-brdf")["PTFE.data.csv"], delimiter=",", skip_header=1)
-    s = rows[rows[:, 0] == wavelength_um]
-    # Axes of the file: docs/reflectance.md.
-    flip = np.diag([1.0, 1.0, 1.0, -1.0])
-    m = np.concatenate([np.ones((len(s), 1)), s[:, 6:]], axis=1).reshape(-1, 4, 4)
-    m = mueller.rotation(-np.deg2rad(s[:, 4])) @ (flip @ m @ flip)
-    normal = np.tile([0.0, 0.0, 1.0], (len(s), 1))
-    surface = ScatteringGeometry(normal, direction(s[:, 1], s[:, 2]), direction(s[:, 3], s[:, 4]), normal)
-    geometry = surface.with_up(surface.s_axis)
-    m = change_frames(m, surface, surface.s_axis)
+    geometry, m = in_facet_axes(rows, wavelength_um)
     # Whole directions of incidence are held out together.
-    _, incidence = np.unique(np.round(s[:, 1] / 5).astype(int), return_inverse=True)
+    of_one = rows[rows[:, 0] == wavelength_um]
+    _, incidence = np.unique(np.round(of_one[:, 1] / 5).astype(int), return_inverse=True)
     return ReflectanceProblem(geometry, m.reshape(-1, 16), 1.35 + 0j, incidence % FOLDS)
 
 

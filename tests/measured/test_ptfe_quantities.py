@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from processing.arrays import Array
 from processing.polarization import mueller, quantities, triply_degenerate
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
+from tests.measured.ptfe import in_surface_axes
 
 pytestmark = pytest.mark.measured
 
@@ -27,16 +28,11 @@ FOUND = {
 MIRROR = np.diag([1.0, 1.0, -1.0, -1.0])
 #: M of the reversed path is RECIPROCAL M^T RECIPROCAL, with x = s on both sides (van de Hulst; Sekera).
 RECIPROCAL = np.diag([1.0, 1.0, -1.0, 1.0])
-OTHER_HANDEDNESS = np.diag([1.0, 1.0, 1.0, -1.0])
 
 
 def load(table: Array, um: float) -> tuple[Array, Array, Array, Array, Array]:
     """M/m00 in s and p of the surface, unpolarized BRDF, polar angles of both beams (deg), azimuth between (rad)."""
-    s = table[table[:, 0] == um]
-    m = np.concatenate([np.ones((len(s), 1)), s[:, 6:]], axis=1).reshape(-1, 4, 4)
-    # The axes of the reflected beam are turned by its azimuth (docs/reflectance.md).
-    m = mueller.rotation(-np.deg2rad(s[:, 4])) @ (OTHER_HANDEDNESS @ m @ OTHER_HANDEDNESS)
-    wi, wo = (_direction(s[:, k], s[:, k + 1]) for k in (1, 3))
+    s, m, wi, wo = in_surface_axes(table, um)
     azimuth = np.arctan2(np.cross(wi, wo)[:, 2], np.sum(wi[:, :2] * wo[:, :2], axis=1))
     return m, s[:, 5], np.rad2deg(np.arccos(wi[:, 2])), np.rad2deg(np.arccos(wo[:, 2])), azimuth
 
@@ -83,11 +79,6 @@ def triply_degenerate_with_noise(m: Array, sigma: Array, seed: int) -> Array:
 
 def squared_deviation(xi: Array) -> Array:
     return np.sum(quantities.deviation_from_td(xi) ** 2, axis=-1)
-
-
-def _direction(theta_deg: Array, phi_deg: Array) -> Array:
-    t, p = np.deg2rad(theta_deg), np.deg2rad(phi_deg)
-    return np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], axis=-1)
 
 
 def figure(table: Array, out: Path) -> None:

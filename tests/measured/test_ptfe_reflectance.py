@@ -5,45 +5,17 @@ light, and the axes of the reflected beam are not its s and p but turned from th
 singular at the normal. The first test shows the turn; without it no model fits.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 
-from processing.geometry.frames import ScatteringGeometry, change_frames
-from processing.polarization import mueller
 from processing.polarization.cloude import xi0_and_dominant
 from processing.reflectance import first_surface
 from processing.reflectance.material_fit import fit_values
+from tests.measured.ptfe import in_facet_axes
 
 pytestmark = pytest.mark.measured
 
 WAVELENGTHS_UM = (0.351, 0.532, 0.633, 1.064)
-OTHER_HANDEDNESS = np.diag([1.0, 1.0, 1.0, -1.0])
-
-
-class Ptfe(NamedTuple):
-    """Geometry with y along s of the facet, and M/m00 in those axes."""
-
-    geometry: ScatteringGeometry
-    m: np.ndarray
-
-
-def direction(theta_deg: np.ndarray, phi_deg: np.ndarray) -> np.ndarray:
-    t, p = np.deg2rad(theta_deg), np.deg2rad(phi_deg)
-    return np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], axis=-1)
-
-
-def load(rows: np.ndarray, wavelength_um: float, turn: float = -1.0) -> Ptfe:
-    """PTFE at one wavelength; `turn` times the azimuth of the reflected beam is undone."""
-    s = rows[rows[:, 0] == wavelength_um]
-    m = np.concatenate([np.ones((len(s), 1)), s[:, 6:]], axis=1).reshape(-1, 4, 4)
-    m = mueller.rotation(turn * np.deg2rad(s[:, 4])) @ (OTHER_HANDEDNESS @ m @ OTHER_HANDEDNESS)
-    normal = np.tile([0.0, 0.0, 1.0], (len(s), 1))
-    # Axes x = unit(n cross k), y = k cross x are s and p of the surface.
-    surface = ScatteringGeometry(normal, direction(s[:, 1], s[:, 2]), direction(s[:, 3], s[:, 4]), normal)
-    instrument = surface.with_up(surface.s_axis)
-    return Ptfe(instrument, change_frames(m, surface, surface.s_axis))
 
 
 @pytest.fixture(scope="module")
@@ -60,14 +32,14 @@ def coupling(m: np.ndarray) -> float:
 
 @pytest.mark.parametrize("wavelength_um", WAVELENGTHS_UM)
 def test_axes_of_the_reflected_beam_are_turned_by_its_azimuth(rows, wavelength_um):
-    as_found, other_way, not_at_all = (coupling(load(rows, wavelength_um, t).m) for t in (-1.0, 1.0, 0.0))
+    as_found, other_way, not_at_all = (coupling(in_facet_axes(rows, wavelength_um, t)[1]) for t in (-1.0, 1.0, 0.0))
     assert as_found < 0.6 * not_at_all
     assert as_found < 0.5 * other_way
 
 
-def explained(data: Ptfe, model: np.ndarray) -> float:
+def explained(m: np.ndarray, model: np.ndarray) -> float:
     """Part of the squared polarized elements of M/m00 that the best multiple of the model's takes, all geometries."""
-    polarized, shape = (x.reshape(-1, 16)[:, 1:] for x in (data.m, model))
+    polarized, shape = (x.reshape(-1, 16)[:, 1:] for x in (m, model))
     share = np.sum(polarized * shape, axis=1, keepdims=True) / np.sum(shape**2, axis=1, keepdims=True)
     left = polarized - np.maximum(share, 0) * shape
     return float(1 - np.sum(left**2) / np.sum(polarized**2))
@@ -85,15 +57,13 @@ FOUND = {
 
 @pytest.mark.parametrize("wavelength_um", WAVELENGTHS_UM)
 def test_how_much_of_the_polarized_light_the_model_takes(rows, wavelength_um):
-    data = load(rows, wavelength_um)
-    every = np.tile(np.eye(16), (len(data.m), 1, 1))
-    fit = fit_values(
-        data.geometry, data.m.reshape(-1, 16).T, np.eye(16), every, max_pixels=len(data.m), correlation=True
-    )
-    best = explained(data, fit.model("PTFE", 1000 * wavelength_um).mueller_jones(data.geometry, 1000 * wavelength_um))
-    own = explained(data, xi0_and_dominant(data.m)[1])
+    geometry, m = in_facet_axes(rows, wavelength_um)
+    every = np.tile(np.eye(16), (len(m), 1, 1))
+    fit = fit_values(geometry, m.reshape(-1, 16).T, np.eye(16), every, max_pixels=len(m), correlation=True)
+    best = explained(m, fit.model("PTFE", 1000 * wavelength_um).mueller_jones(geometry, 1000 * wavelength_um))
+    own = explained(m, xi0_and_dominant(m)[1])
     plain = first_surface.Model(name="PTFE", constants={633: first_surface.Constants(n=1.35)})
-    fresnel = explained(data, plain.mueller_jones(data.geometry, 633))
+    fresnel = explained(m, plain.mueller_jones(geometry, 633))
     assert (own, best, fresnel) == pytest.approx(FOUND[wavelength_um], abs=0.01)
     assert best == pytest.approx(1 - fit.residual**2, abs=1e-6)
     # Towards n = 1 the ratio r_p/r_s becomes that of a dipole, cos(2 theta_d): volume scattering, no surface.

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from random_matrices import random_mueller
 
 from processing.computing.threads import for_ranges, thread_count
 from processing.polarization import mueller
@@ -21,14 +22,6 @@ def solve(m: Array) -> tuple[Array, Array]:
     return w[..., ::-1], mueller.from_jones(jones)[..., ::-1, :, :]
 
 
-def random_mueller(count: int, seed: int, spread: float = 3.0) -> Array:
-    """Physical matrices, from nearly pure to strongly depolarizing, of random throughput."""
-    rng = np.random.default_rng(seed)
-    jones = rng.normal(size=(count, 4, 2, 2)) + 1j * rng.normal(size=(count, 4, 2, 2))
-    weights = rng.exponential(size=(count, 4, 1, 1)) ** spread
-    return (mueller.from_jones(jones) * weights).sum(axis=1)
-
-
 def with_eigenvalues(xi: Array, count: int, seed: int) -> tuple[Array, Array]:
     """Matrices of given eigenvalues in random directions, and the Mueller-Jones matrix of the first."""
     rng = np.random.default_rng(seed)
@@ -38,7 +31,7 @@ def with_eigenvalues(xi: Array, count: int, seed: int) -> tuple[Array, Array]:
 
 
 def test_agrees_with_the_eigenvalue_solver() -> None:
-    m = random_mueller(3000, seed=1)
+    m = random_mueller(3000, seed=1, spread=3.0)
     xi, parts = solve(m)
     np.testing.assert_allclose(coherency_eigenvalues(m), xi, atol=1e-13)
     xi0, m0 = xi0_and_dominant(m)
@@ -47,7 +40,7 @@ def test_agrees_with_the_eigenvalue_solver() -> None:
 
 
 def test_unphysical_matrices_keep_their_negative_eigenvalues() -> None:
-    m = random_mueller(500, seed=2) + np.random.default_rng(3).normal(scale=0.5, size=(500, 4, 4))
+    m = random_mueller(500, seed=2, spread=3.0) + np.random.default_rng(3).normal(scale=0.5, size=(500, 4, 4))
     m = m[m[:, 0, 0] > 0.3]
     xi = solve(m)[0]
     assert xi.min() < -0.01
@@ -92,7 +85,7 @@ def test_below_a_quarter_the_model_process_has_the_smallest_eigenvalue() -> None
 
 
 def test_the_four_parts_add_up() -> None:
-    m = random_mueller(300, seed=6)
+    m = random_mueller(300, seed=6, spread=3.0)
     xi, parts = cloude(m)
     np.testing.assert_allclose(np.einsum("nk,nkij->nij", xi, parts) * m[:, :1, :1], m, rtol=0, atol=1e-12 * m.max())
     np.testing.assert_allclose(parts, solve(m)[1], atol=1e-9)
@@ -111,7 +104,7 @@ def test_what_has_no_answer_is_nan() -> None:
 
 
 def test_layout_and_type_do_not_matter() -> None:
-    m = random_mueller(7 * 900, seed=7).reshape(7, 900, 4, 4)
+    m = random_mueller(7 * 900, seed=7, spread=3.0).reshape(7, 900, 4, 4)
     xi0, m0 = xi0_and_dominant(m)
     planar = np.ascontiguousarray(np.moveaxis(m, (-2, -1), (0, 1)))
     for view in (np.moveaxis(planar, (0, 1), (-2, -1)), np.swapaxes(np.swapaxes(m, 0, 1).copy(), 0, 1)):
@@ -143,7 +136,7 @@ def test_physical_matrices_have_no_negative_eigenvalue(seed: int, spread: float)
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**31), st.floats(-4, 4), st.floats(-4, 4))
 def test_turning_the_frames_turns_the_dominant_process_and_keeps_xi0(seed: int, before: float, after: float) -> None:
-    m = random_mueller(5, seed)
+    m = random_mueller(5, seed, spread=3.0)
     turn_out, turn_in = mueller.rotation(after), mueller.rotation(before)
     xi0, m0 = xi0_and_dominant(m)
     turned_xi0, turned = xi0_and_dominant(turn_out @ m @ turn_in)

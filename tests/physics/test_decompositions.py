@@ -22,6 +22,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from random_matrices import random_mueller
 from scipy.linalg import expm, logm
 
 from processing.polarization import mueller, quantities
@@ -31,12 +32,6 @@ from processing.polarization.decompositions.lu_chipman import depolarization_pow
 from processing.polarization.decompositions.symmetric import G, symmetric
 
 Array = NDArray[np.float64]
-
-
-def random_mueller(count: int, seed: int, spread: float = 2.0) -> Array:
-    rng = np.random.default_rng(seed)
-    jones = rng.normal(size=(count, 4, 2, 2)) + 1j * rng.normal(size=(count, 4, 2, 2))
-    return (mueller.from_jones(jones) * rng.exponential(size=(count, 4, 1, 1)) ** spread).sum(axis=1)
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from random_matrices import random_mueller
 
 from processing.errors import ProcessError
 from processing.polarization import mueller, quantities, scalar_files, triply_degenerate
@@ -15,12 +16,6 @@ from processing.polarization.quantities import PAPER_PAIRS, POLARIZATIONS, betwe
 from processing.polarization.scalar_files import scalar_quantities
 
 Array = NDArray[np.float64]
-
-
-def random_mueller(count: int, seed: int, spread: float = 2.0) -> Array:
-    rng = np.random.default_rng(seed)
-    jones = rng.normal(size=(count, 4, 2, 2)) + 1j * rng.normal(size=(count, 4, 2, 2))
-    return (mueller.from_jones(jones) * rng.exponential(size=(count, 4, 1, 1)) ** spread).sum(axis=1)
 
 
 def test_depolarization_index_and_entropy_of_known_matrices() -> None:
