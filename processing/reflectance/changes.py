@@ -64,7 +64,8 @@ class ReflectanceChanges:
         jones = fresnel.jones(g, index)
         if self.volume:
             # Fresnel's ratio of amplitudes at an index near one is that of a dipole.
-            jones = (1 - self.volume) * _unit_strength(jones) + self.volume * _unit_strength(fresnel.jones(g, DIPOLE))
+            dipole = fresnel.jones(g, DIPOLE)
+            jones = (1 - self.volume) * jones + self.volume * (_strength(jones) / _strength(dipole)) * dipole
         if self.diffuse_a:
             weight = self.diffuse_a * np.sin(g.angles.theta_h) ** np.exp(self.diffuse_log_b)
             jones = jones + weight[..., None, None] * diffuse_jones(g)
@@ -85,8 +86,8 @@ class ReflectanceChanges:
         return ScatteringGeometry(normal, _about_y(g.to_source, self.arm_rad), g.to_camera, g.up)
 
 
-def _unit_strength(jones: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    return np.asarray(jones / np.sqrt(np.sum(np.abs(jones) ** 2, axis=(-2, -1), keepdims=True)))
+def _strength(jones: NDArray[np.complex128]) -> Array:
+    return np.asarray(np.sqrt(np.sum(np.abs(jones) ** 2, axis=(-2, -1), keepdims=True)))
 
 
 def _about_y(v: Array, angle: float) -> Array:

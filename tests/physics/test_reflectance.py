@@ -9,6 +9,8 @@ from processing.geometry.frames import ScatteringGeometry, unit
 from processing.polarization import mueller
 from processing.reflectance import fresnel, polarized_diffuse
 from processing.reflectance.base import kinds, load_reflectance, normalized_mueller
+from processing.reflectance.changes import ReflectanceChanges
+from processing.reflectance.effects.base import reflectance_effects
 from processing.yaml_file import ConfigError
 from simulators.conformance import ReflectanceConformance
 from simulators.conformance.reflectance import random_geometry
@@ -111,3 +113,13 @@ def test_unknown_kind_key_and_wavelength_are_named(tmp_path: Path, configs: Path
     red = load_reflectance(configs / "materials/red_print.yaml")
     with pytest.raises(ConfigError, match="524"):
         red.mueller_jones(random_geometry(2), 524)
+
+
+@pytest.mark.parametrize("kind", reflectance_effects())
+def test_a_small_effect_changes_little_also_beside_a_diffuse_term(kind):
+    effect, g = reflectance_effects()[kind], random_geometry(100)
+    for place in effect.places_on("flat"):
+        without, bent = (ReflectanceChanges(diffuse_a=0.17) for _ in range(2))
+        effect.bend(bent, place, 1e-6 * np.array([p.typical for p in effect.parameters(place)]))
+        apart = bent.dominant(g, 1.3 + 0.08j) - without.dominant(g, 1.3 + 0.08j)
+        assert np.abs(apart).max() < 1e-4

@@ -12,7 +12,7 @@ from processing.reflectance.effects.base import ReflectanceEffect
 
 
 class VolumeScattering(ReflectanceEffect):
-    """Share of the dipole's Jones matrix beside the first surface's, both of unit strength; 1 is all dipole."""
+    """Share of the dipole's Jones matrix beside the first surface's, which has the same strength; 1 is all dipole."""
 
     def parameters(self, place: str) -> tuple[Parameter, ...]:
         return (Parameter("share", "1", -1.0, 4.0, 0.2),)
