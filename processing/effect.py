@@ -66,10 +66,6 @@ class Effect:
     is_projected: ClassVar[bool] = False
     #: Holds where an instrument file names it, and is not looked for: an unknown sample would take it up.
     from_file_only: ClassVar[bool] = False
-    #: Its values trade off along a bent valley: curvature at one point tells neither minimum nor error.
-    has_bent_valley: ClassVar[bool] = False
-    #: Part of what it explains (chi-square) that its simple form may leave over.
-    rough: ClassVar[float] = 0.0
     #: The one look or capture that shows it, if there is one, in a sentence.
     advice: ClassVar[str] = ""
 

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE, PART_OF_LEFT
+from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE
 from processing.diagnosis.instrument.guard import chances, lasts
 from processing.diagnosis.search.decision import PredictedChange, predicted_change
+from processing.diagnosis.search.names import PART_OF_LEFT
 
 NOTHING = PredictedChange(0.0, 0.0, 0.0, 0.0, 0.0)
 

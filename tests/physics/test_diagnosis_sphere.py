@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.diagnosis.search.fit import minimize
+from processing.diagnosis.search.correction import solution
+from processing.diagnosis.search.posterior import posterior
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.data import read_surface
-from processing.diagnosis.surface.diagnose import SurfaceDiagnosis, diagnose_object
+from processing.diagnosis.surface.diagnose import SurfaceDiagnosis, as_wide_as_the_valley, diagnose_object
 from processing.diagnosis.surface.problem import SurfaceProblem
-from processing.diagnosis.surface.standard_errors import standard_errors
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.effects.base import ReflectanceEffect
@@ -133,10 +133,11 @@ def test_an_index_where_little_is_polarized_has_an_honest_error(scene, configs, 
         data = read_surface(capture, declared.at(NM), scene.object.geometry, fault.material)
     problem = SurfaceProblem(declared.at(NM), [data])
     space = Space(tuple(c for c in problem.pool() if c.kind == "refractive_index"))
-    fit = minimize(problem, space, np.zeros(2))
-    error = standard_errors(problem, space, fit, 1.0)
+    found = posterior(problem, space, (), np.zeros(2), say=lambda line: None)
+    solved = solution(problem, found, Space(()), np.zeros(0))
+    error = np.sqrt(np.diag(as_wide_as_the_valley(problem, found, solved)[1]))
     truth = np.array([fault.parameters["refractive_index"][n] for n in ("n", "k")])
-    assert np.all(np.abs(fit.values - truth) < 3.5 * error)
+    assert np.all(np.abs(found.values - truth) < 3.5 * error)
     assert error[0] < 0.05
 
 

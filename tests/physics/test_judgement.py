@@ -10,7 +10,7 @@ from processing.diagnosis.search.decision import Judgement
 from processing.diagnosis.search.fit import Fit, Solution
 from processing.diagnosis.search.result import Check
 from processing.diagnosis.search.space import Space, Sums
-from processing.diagnosis.surface import guard
+from processing.diagnosis.surface import quantities
 from processing.effect import Parameter
 from processing.instrument.effects.psg_retardance import PsgRetardance
 
@@ -56,8 +56,8 @@ def test_where_no_pixel_shows_xi0_nothing_is_said_of_it(monkeypatch) -> None:
     fit = Fit(np.ones(1), Sums.empty(1, 1), 0.0)
     solved = Solution(Space(()), fit, None, Space((candidate,)), fit, None)
     problem = SimpleNamespace(captures=[None])
-    monkeypatch.setattr(guard, "xi0_of", lambda *of: np.full(5, np.nan))
-    assert guard.chances(problem, solved, np.eye(1)) == ()
-    monkeypatch.setattr(guard, "xi0_of", lambda problem, k, space, values: np.append(0.1 * values, np.nan))
-    told = guard.change_of_xi0(problem, solved, 0.01 * np.eye(1))
+    monkeypatch.setattr(quantities, "xi0_of", lambda *of: np.full(5, np.nan))
+    assert quantities.chances(problem, solved, np.eye(1)) == ()
+    monkeypatch.setattr(quantities, "xi0_of", lambda problem, k, space, values: np.append(0.1 * values, np.nan))
+    told = quantities.change_of_xi0(problem, solved, 0.01 * np.eye(1))
     assert (told.size, told.stderr) == pytest.approx((0.1, 0.0071), abs=1e-4)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,38 +12,24 @@ from processing.computing.blas import one_blas_thread
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.captured.screening import screened
-from processing.diagnosis.instrument.answer import (
-    calibrated,
-    capture_report,
-    correction,
-    error,
-    floor,
-    missing,
-    noise_report,
-    not_measured,
-    ranking,
-    told_effects,
-    told_switches,
-    unobservable,
-)
-from processing.diagnosis.instrument.doubts import (
-    doubts,
-    testable,
-)
-from processing.diagnosis.instrument.guard import chances, checks, lasts
+from processing.diagnosis.instrument.answer import calibrated, capture_report, missing, noise_report, not_measured
+from processing.diagnosis.instrument.doubts import doubts, testable
+from processing.diagnosis.instrument.guard import chances, lasts
 from processing.diagnosis.instrument.mueller_error import MuellerErrors
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
 from processing.diagnosis.instrument.structure import Residual, descriptions, residual
-from processing.diagnosis.instrument.whole_bench import WholeBench, predicts, solution
+from processing.diagnosis.instrument.whole_bench import WholeBench, predicts
 from processing.diagnosis.instrument.wiring import Wiring, miswired, miswired_train
-from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import Cause, causes, wanted_for_evidence, would_be_seen
-from processing.diagnosis.search.decision import Judgement, beyond_chance, refusal
+from processing.diagnosis.search.causes import causes, would_be_seen
+from processing.diagnosis.search.correction import solution
+from processing.diagnosis.search.decision import Judgement, beyond_chance
 from processing.diagnosis.search.fit import Solution
+from processing.diagnosis.search.names import Names
 from processing.diagnosis.search.posterior import Posterior, Say
-from processing.diagnosis.search.result import Diagnosis, FoundEffect, Unexplained
-from processing.diagnosis.search.rules import LIKELY, MOST_TRIED, OUTSTANDING
+from processing.diagnosis.search.result import Diagnosis, FoundEffect
+from processing.diagnosis.search.rules import FAR_OFF, LIKELY, OUTSTANDING, SHARES
+from processing.diagnosis.tell.answer import Answer, checks, told_switches, unobservable
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture, CaptureError
 
@@ -69,7 +55,9 @@ class Outcome:
 
 def outcome_of(bench: WholeBench, found: Posterior) -> Outcome:
     """Test what a posterior leaves."""
-    asked, solved = predicts(bench.problem), solution(bench, found)
+    asked = predicts(bench.problem)
+    unfit = bench.as_many_as_intensities(found, SHARES)
+    solved = solution(asked, found, bench.base, bench.base.vector(bench.start), unfit=unfit)
     captures = range(len(asked.captures))
     before = tuple(residual(asked, k, solved.base, solved.before_fit) for k in captures)
     after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
@@ -99,31 +87,6 @@ def white(r: Residual) -> bool:
     return bool(abs(lag) * np.sqrt(mean.size) < OUTSTANDING)
 
 
-@dataclass(frozen=True)
-class Names:
-    """Causes that are told.
-
-    Attributes
-    ----------
-    named : likely ones; doubt : why some of them have no sure name.
-    untold : as many values as the data have, which have no name at all.
-    """
-
-    named: tuple[Cause, ...]
-    untold: tuple[Cause, ...]
-    doubt: Mapping[Cause, str]
-
-    @property
-    def sure(self) -> list[Cause]:
-        """Those that nothing speaks against."""
-        return [c for c in self.named if c.answer != "unknown" and c not in self.doubt]
-
-    @property
-    def rivals(self) -> list[tuple[Candidate, ...]]:
-        """Sets of effects of which one is there."""
-        return [(c.candidates[0], *c.others) for c in self.named if c.others]
-
-
 def names_of(outcome: Outcome) -> Names:
     """Names of the causes of a posterior, as far as what is left over allows them."""
     asked, found, solved = outcome.asked, outcome.found, outcome.solved
@@ -132,7 +95,7 @@ def names_of(outcome: Outcome) -> Names:
     named = tuple(c for c in likely if c not in untold)
     # What as many values as the data have took away may be any structure.
     left = outcome.left + sum(2 * c.log_odds * found.samples.best.unit for c in untold)
-    return Names(named, untold, doubts(asked, found, solved, named, left=left))
+    return Names(named, doubts(asked, found, solved, named, left=left), untold)
 
 
 @dataclass(frozen=True)
@@ -196,43 +159,23 @@ def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: 
         chances=chances(here, later, lasting, each) if solved.effects else (),
         first=None if wiring is None else wiring.told,
     )
-    any_cause = judgement.named or bool(names.untold)
-    # What makes the residual worse is no cause, however well it fits.
-    worse = refusal(judgement.figures)
-    kept, verdict = judgement.kept(solved, any_cause), judgement.verdict
-    unseen = unobservable(used.bench.whole, found)
+    answer = Answer(asked, found, solved, names, judgement, switched)
+    kept, unseen = answer.kept, unobservable(used.bench.whole, found)
+    # Values that are merely nominal are nowhere near what is true.
+    nominal = any(c.place for c in solved.base.candidates)
+    known = judgement.refused is None or not nominal or (judgement.first is None and solved.before.rms < FAR_OFF)
     diagnosis = Diagnosis(
-        verdict=verdict,
-        error_before=error(asked, solved, solved.before),
-        error_after=error(asked, kept, kept.after),
-        noise_floor_percent=floor(asked, kept),
-        effects=(
-            *(
-                e
-                for c in names.named
-                for e in told_effects(asked, solved, c, worse or names.doubt.get(c), not_applied=judgement.refused)
-            ),
-            *switched,
-        ),
-        unobservable=(
-            *dict.fromkeys(c.short for c in unseen),
-            *(f"{c.candidates[0].short} (as many values as the data have)" for c in names.untold),
-        ),
-        recommendation=wanted_for_evidence(problem)
-        if verdict == "undetermined"
-        else recommended(problem, kept.space, kept.fit, names.rivals, unseen=missing(unseen)),
-        unexplained=_unexplained(used, names) if verdict in ("unexplained", "partly_explained") else None,
-        calibrated=calibrated(problem, found, kept),
-        ranking=ranking(found, solved.before),
-        captures=tuple(
-            capture_report(asked, k, kept, before, after=after)
-            for k, (before, after) in enumerate(zip(used.before, used.after, strict=True))
-        ),
-        instrument=problem.model.name,
-        wavelengths_nm=tuple(sorted(set(problem.wavelengths_nm))),
-        simulated=any(c.simulated for c in problem.captures),
-        correction=correction(
-            problem, found, solved, any_cause, judgement=judgement, lasts=lasting, used=kept, errors=errors
+        **answer.told(
+            recommended=lambda: recommended(problem, kept.space, kept.fit, names.rivals, unseen=missing(unseen)),
+            descriptions=descriptions([c.name for c in asked.captures], used.after),
+            captures=[
+                capture_report(asked, k, kept, before, after=after)
+                for k, (before, after) in enumerate(zip(used.before, used.after, strict=True))
+            ],
+            unseen=unseen,
+            calibrated=calibrated(problem, found, kept),
+            lasts=lasting,
+            uncertain=errors.uncertain(problem, kept) if known else None,
         ),
         wiring=judgement.first,
         branch=used.bench.branch,
@@ -240,14 +183,6 @@ def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: 
         noise=noise_report(problem),
     )
     return Judged(diagnosis, problem, kept, used.before, used.after if kept is solved else used.before, used.after)
-
-
-def _unexplained(used: Outcome, names: Names) -> Unexplained:
-    tried = tuple(c.candidates[0].label for c in names.named)
-    return Unexplained(
-        description=descriptions([c.name for c in used.asked.captures], used.after),
-        tried=tried or tuple(r.candidate for r in ranking(used.found, used.solved.before)[:MOST_TRIED]),
-    )
 
 
 @one_blas_thread()

@@ -12,18 +12,9 @@ from processing.diagnosis.instrument.unevenness import Evenness
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, shown
 from processing.diagnosis.search.fit import Solution
+from processing.diagnosis.search.names import AT_BOUND, at_bound, with_parts
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import (
-    BOUND,
-    CERTAIN,
-    EDGES,
-    LIMIT,
-    OUTSTANDING,
-    SURE,
-    TESTABLE,
-    TIMES,
-    UNEVEN_SHARE,
-)
+from processing.diagnosis.search.rules import EDGES, LIMIT, OUTSTANDING, SURE, TESTABLE, UNEVEN_SHARE
 
 #: The image does not move where that would be seen best.
 STANDS = "the edges, which were left out of the fit, do not move as it says"
@@ -36,10 +27,6 @@ ELSE = (STANDS, NOT_ALIKE)
 #: The reason for which nothing is written for later captures: the sample or its light changed, and what is found beside
 #: that may be a part of it.
 OF_THE_SAMPLE = "it differs from part to part of the image, which a source does not"
-#: Reasons that leave a name likely.
-PART_OF_LEFT = "it may be a part of what is left unexplained"
-PART_OF_UNLISTED = "it may be a part of the fault that has no name"
-PARTS = (PART_OF_LEFT, PART_OF_UNLISTED)
 
 
 def doubts(
@@ -50,31 +37,17 @@ def doubts(
     still = _standing(problem, solved, causes)
     even = Evenness(problem, solved.space, solved.fit.values)
     for cause in causes:
-        reason = STANDS if cause in still else _of_itself(problem, found, solved, cause, causes=causes, even=even)
+        reason = STANDS if cause in still else _of_itself(problem, solved, cause, causes=causes, even=even)
         if reason is not None:
             out[cause] = reason
     # What is something else took away a part of what is left over.
     another = [c.log_odds for c, why in out.items() if why in ELSE and c.log_odds > STANDS_OUT]
     left += 2 * found.samples.best.unit * sum(another)
-    for rank, cause in enumerate(causes, 1):
-        if problem.noise_known:
-            weak = 2 * cause.log_odds * found.samples.best.unit < TIMES * rank**2 * left
-        else:
-            general = cause.candidates[0].effect.per_state or cause.candidates[0].is_pointwise
-            rest = found.sets.noise.directions if general else 0.0
-            weak = cause.log_odds < max(CERTAIN, TIMES * rest / 2)
-        if cause not in out and weak:
-            out[cause] = PART_OF_LEFT
-    # A sentence is a part of an unknown mechanism, whose other parts look like effects of the list.
-    unlisted = [k for k in range(len(found.members)) if found.label(k).price]
-    if found.samples.any_of(unlisted) > 0.5:
-        out |= {cause: PART_OF_UNLISTED for cause in causes if cause not in out and cause.answer != "unlisted"}
-    return out
+    return with_parts(found, causes, out, left=left, noise_known=problem.noise_known)
 
 
 def _of_itself(
     problem: InstrumentProblem,
-    found: Posterior,
     solved: Solution,
     cause: Cause,
     *,
@@ -83,8 +56,8 @@ def _of_itself(
 ) -> str | None:
     """The reason that a cause gives by itself, whatever is left of the others."""
     effect = cause.candidates[0].effect
-    if _at_bound(cause):
-        return "a value stands at its bound: the data ask for something else"
+    if at_bound(cause):
+        return AT_BOUND
     if effect.per_state:
         if not testable(problem, solved, cause, causes):
             return "as many values as the data have"
@@ -134,14 +107,6 @@ def testable(problem: InstrumentProblem, solved: Solution, cause: Cause, causes:
         all_values + others < TESTABLE * sum(directions)
         or np.any((np.array(values) + others < TESTABLE * np.array(directions)) & shows)
     )
-
-
-def _at_bound(cause: Cause) -> bool:
-    for candidate, values in zip(cause.candidates, cause.values, strict=True):
-        width = candidate.upper - candidate.lower
-        if np.any(np.minimum(values - candidate.lower, candidate.upper - values) < BOUND * width):
-            return True
-    return False
 
 
 def _uneven(even: Evenness, solved: Solution, candidate: Candidate, cause: Cause) -> bool:

@@ -1,38 +1,11 @@
-"""What a correction of an instrument does to its captures, and to the Mueller matrices of these and later ones."""
-
-from __future__ import annotations
+"""What a correction of an instrument does to the Mueller matrices of its captures and of later ones."""
 
 from collections.abc import Collection, Mapping
 
-from processing.arrays import Array
-from processing.diagnosis.instrument.answer import stretch
 from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE
-from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.search.decision import PredictedChange, chance_checks, held_out_check, rows_checks
-from processing.diagnosis.search.fit import Fit, Solution
+from processing.diagnosis.search.decision import PredictedChange, chance_checks
 from processing.diagnosis.search.result import Check
 from processing.diagnosis.search.rules import CHANCE_WORSE
-from processing.diagnosis.search.space import Space
-
-
-def checks(problem: InstrumentProblem, solved: Solution) -> tuple[Check, ...]:
-    """Held-out residual, rank and condition of W, before and after: if one gets worse, it is no explanation."""
-    out = [held_out_check(solved, stretch(problem, solved))]
-    several = len(problem.captures) > 1
-    for k, data in enumerate(problem.captures):
-        if several:
-            # The sum decides; what became of each is told also where nothing is written.
-            old, new = (100 * found.of(k).rms for found in (solved.before, solved.after))
-            name = f"rms on held-out data of {data.name} at {data.wavelength_nm:g} nm, percent"
-            out.append(Check(name=name, before=old, after=new, holds=True))
-        out += rows_checks(
-            data.name,
-            *(
-                _rows(problem, k, space, fit)
-                for space, fit in ((solved.base, solved.before_fit), (solved.space, solved.fit))
-            ),
-        )
-    return tuple(out)
 
 
 def chances(
@@ -71,8 +44,3 @@ def lasts(later: PredictedChange, reasons: Collection[str] = ()) -> bool:
     Where the sample changed, what is found of the instrument may be a part of that.
     """
     return later.chance_worse <= CHANCE_WORSE and OF_THE_SAMPLE not in reasons
-
-
-def _rows(problem: InstrumentProblem, k: int, space: Space, fit: Fit) -> Array:
-    changes = problem.changes(k, space, fit.values)
-    return problem.models[k].rows(problem.captures[k].conditions.angles_deg, changes).reshape(-1, 16)

@@ -98,8 +98,7 @@ def _without_levels(w: Array, m: Array, channels: int) -> Array:
 
 def _all_columns(problem: InstrumentProblem, k: int, changes: Changes) -> Array:
     """Rows (L, 16) of the measurement matrix in units of their noise, whatever the sample."""
-    data = problem.captures[k]
-    w = problem.models[k].rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
+    w = problem.rows_of(k, changes) * problem.captures[k].row_exposure[:, None]
     return np.asarray(w / problem.moments[k].sigma[:, None])
 
 

@@ -238,6 +238,26 @@ class InstrumentProblem:
                 candidate.apply(changes, model, values[part])
         return changes
 
+    @property
+    def held_out(self) -> str:
+        """What is predicted by what, in words."""
+        if self.folds == 1:
+            return "nothing: too few values; each fitted value takes a degree of freedom"
+        return "; ".join(dict.fromkeys(m.held_out for m in self.moments))
+
+    def noise_floor(self, space: Space, values: Array, k: int | None = None) -> float:
+        """Rms noise over the mean signal, of one capture or of all, with the counts corrected by these values."""
+        moments = self.near(space, values)[0].moments
+        return float(np.sqrt(np.mean([m.noise_floor**2 for m in (moments if k is None else moments[k : k + 1])])))
+
+    def rows(self, k: int, space: Space, values: Array) -> Array:
+        """Measurement matrix W (L, 16) of a capture, for exposures of one."""
+        return self.rows_of(k, self.changes(k, space, values))
+
+    def rows_of(self, k: int, changes: Changes) -> Array:
+        """The same of the changes of a capture."""
+        return self.models[k].rows(self.captures[k].conditions.angles_deg, changes).reshape(-1, 16)
+
     def columns(self, capture: int, changes: Changes) -> Array:
         """A (L, K), rows in units of their noise."""
         a = self._columns_of_one_source(capture, changes)
@@ -251,7 +271,7 @@ class InstrumentProblem:
     def _columns_of_one_source(self, capture: int, changes: Changes) -> Array:
         """A (L, K) where the source has the same level in all states."""
         data = self.captures[capture]
-        w = self.models[capture].rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
+        w = self.rows_of(capture, changes) * data.row_exposure[:, None]
         a = w if data.sample is None else (w @ data.sample)[:, None]
         return np.asarray(a / self.moments[capture].sigma[:, None])
 

@@ -98,15 +98,12 @@ def _power(
 def _signature(problem: InstrumentProblem, space: Space, fit: Fit, sample: Array, *, candidate: Candidate) -> Array:
     """Change (L, parameters) of the relative signal for typical sizes, the throughput projected out."""
     capture = next(k for k, w in enumerate(problem.wavelengths_nm) if candidate.acts(k, w))
-    data = problem.captures[capture]
     both = Space((*space.candidates, candidate)) if candidate not in space.candidates else space
     zero = np.concatenate([fit.values, np.zeros(both.size - space.size)])
     part = both.slices[both.candidates.index(candidate)]
 
     def signal(values: Array) -> Array:
-        changes = problem.changes(capture, both, values)
-        w = problem.models[capture].rows(data.conditions.angles_deg, changes).reshape(-1, 16)
-        return np.asarray(w @ sample)
+        return np.asarray(problem.rows(capture, both, values) @ sample)
 
     start = signal(zero)
     scale = np.linalg.norm(start)

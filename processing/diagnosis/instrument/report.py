@@ -1,7 +1,8 @@
-"""The report of a diagnosis: one HTML file with its figures inside, before and after on the same scales."""
+"""What the report of a diagnosis shows of each capture of an instrument."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,12 +17,11 @@ from processing.diagnosis.instrument.structure import HARMONICS, Residual, harmo
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.range_of import rank_of
 from processing.diagnosis.search.space import Space
+from processing.diagnosis.tell.report import CaptureSection, write_diagnosis_report
 from processing.polarization.cloude import xi0_and_dominant
 from processing.reports.colours import SIGNED, upper_end
-from processing.reports.design import style, templates
 from processing.reports.figure_style import clipped, png
 from processing.reports.template import Figure as Picture
-from processing.whole_file import write_new_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,74 +29,18 @@ if TYPE_CHECKING:
 
 def write_report(path: Path, judged: Judged, problem: InstrumentProblem) -> None:
     """Write the report to a new file. Raises ProcessError if it exists."""
-    found = judged.diagnosis
-    text = (
-        templates()
-        .get_template("diagnosis_report.html")
-        .render(
-            title=f"diagnose: {found.instrument}",
-            style=style(),
-            simulated=found.simulated,
-            d=found,
-            errors=_errors(judged),
-            effects=_effects(judged),
-            ranking=_ranking(judged),
-            captures=[_capture(judged, problem, k) for k in range(len(problem.captures))],
-        )
-    )
-    write_new_text(path, text)
+    captures = [_capture(judged, problem, k) for k in range(len(problem.captures))]
+    write_diagnosis_report(path, judged.diagnosis, captures)
 
 
-def _errors(judged: Judged) -> list[list[str]]:
-    d = judged.diagnosis
-    kind = "residual" if d.noise_floor_percent is None else "residual beyond noise"
-    floor = "not known" if d.noise_floor_percent is None else f"{d.noise_floor_percent:.4f} %"
-    return [
-        ["", kind, "rms of single intensities", "chi2 / dof"],
-        *(
-            [when, error.told, f"{error.rms_percent:.4f} %", f"{error.chi2_reduced:.4f}"]
-            for when, error in (("before", d.error_before), ("after", d.error_after))
-        ),
-        ["noise", "", floor, "1"],
-    ]
-
-
-def _effects(judged: Judged) -> list[list[str]]:
-    """Rows of a table with its head; empty where no effect is named."""
-    rows = []
-    several = len(judged.diagnosis.captures) > 1
-    for e in judged.diagnosis.effects:
-        for name, p in e.parameters.items():
-            # What is told of the effect as a whole stands in its first row.
-            kind = e.kind if e.confident else f"{e.kind} (the name may be wrong)"
-            place = ", ".join(filter(None, (e.element, e.capture if several else None)))
-            sure = e.answer or ""
-            if e.probability is not None:
-                sure += f", {e.probability:.3f}" if e.probability < 0.999 else ", over 0.999"
-            whole = (kind, place, sure, f"{e.evidence:.0f}", ", ".join(e.could_be))
-            first = whole if name == next(iter(e.parameters)) else ("",) * len(whole)
-            # Non-breaking spaces: a number stays on one line with its error and unit.
-            value = f"{p.told} {p.unit if p.unit != '1' else ''}".strip().replace(" ", "\u00a0")
-            rows.append([*first[:2], name, value, *first[2:]])
-    head = ["effect", "of", "parameter", "value", "name", "chi2 explained", "or it is"]
-    return [head, *rows] if rows else []
-
-
-def _ranking(judged: Judged) -> list[list[str]]:
-    rows = [[r.candidate, f"{r.evidence:.0f}", f"{r.rms_percent:.4f}"] for r in judged.diagnosis.ranking]
-    return [["candidate, alone", "chi2 gain on held-out data", "residual after, rms, %"], *rows] if rows else []
-
-
-def _capture(judged: Judged, problem: InstrumentProblem, k: int) -> dict[str, Any]:
+def _capture(judged: Judged, problem: InstrumentProblem, k: int) -> CaptureSection:
     """Title, figures and the change of the Mueller elements of one capture."""
-    return {
-        "name": problem.captures[k].name,
-        "figures": [
-            Picture(png(_pattern(judged, problem, k)), "Leading pattern of the residual"),
-            Picture(png(_states(judged, k)), "Residual of each state"),
-        ],
-        "change": _change(judged, problem, k) if judged.diagnosis.effects else None,
-    }
+    figures = (
+        Picture(png(_pattern(judged, problem, k)), "Leading pattern of the residual"),
+        Picture(png(_states(judged, k)), "Residual of each state"),
+    )
+    elements, note = _change(judged, problem, k) if judged.diagnosis.effects else ((), "")
+    return CaptureSection(problem.captures[k].name, figures, elements=elements, note=note)
 
 
 def _residuals(judged: Judged, k: int) -> dict[str, Residual]:
@@ -233,27 +177,25 @@ def _extent(image: NDArray[np.floating]) -> tuple[float, float, float, float]:
     return -0.5, width - 0.5, height - 0.5, -0.5
 
 
-def _change(judged: Judged, problem: InstrumentProblem, k: int) -> dict[str, Any] | None:
-    """What the correction changes in the Mueller elements and in xi0; None where the states allow no inversion."""
-    found = judged.found
-    first = _mueller(problem, k, found.base, found.before_fit)
-    second = _mueller(problem, k, found.space, found.fit)
+def _change(judged: Judged, problem: InstrumentProblem, k: int) -> tuple[Sequence[Sequence[str]], str]:
+    """What the correction changes in the Mueller elements, and in xi0."""
+    first, second = (_mueller(problem, k, space, fit) for space, fit in judged.found.ends)
     if first is None or second is None:
-        return None
+        return (), "These states do not determine a Mueller matrix. The report gives no change of final quantities."
     difference = np.sqrt(np.mean((second - first) ** 2, axis=0)).reshape(4, 4)
     before, after = (xi0_and_dominant(m.reshape(-1, 4, 4))[0] for m in (first, second))
-    return {
-        "elements": [[""] * 4, *([f"{v:.5f}" for v in line] for line in difference)],
-        "xi0": f"Median xi0 {np.nanmedian(before):.5f} to {np.nanmedian(after):.5f}, rms change "
+    return (
+        [[""] * 4, *([f"{v:.5f}" for v in line] for line in difference)],
+        f"Median xi0 {np.nanmedian(before):.5f} to {np.nanmedian(after):.5f}, rms change "
         f"{np.sqrt(np.nanmean((after - before) ** 2)):.5f}.",
-    }
+    )
 
 
 def _mueller(problem: InstrumentProblem, k: int, space: Space, fit: Fit) -> Array | None:
     problem, values = problem.near(space, fit.values)
     data = problem.captures[k]
     changes = problem.changes(k, space, values)
-    w = problem.models[k].rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
+    w = problem.rows_of(k, changes) * data.row_exposure[:, None]
     if rank_of(w) < 16:
         return None
     rows, shape = w.shape[0], data.signal.shape[2:]

@@ -15,7 +15,7 @@ from processing.diagnosis.instrument.pixel_sums import Pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
 from processing.diagnosis.instrument.tiles import tile_columns
-from processing.diagnosis.search.decision import beyond_chance
+from processing.diagnosis.search.decision import beyond_chance, in_deviations
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.linearized import deviation_of
 from processing.diagnosis.search.range_of import range_of
@@ -206,7 +206,7 @@ def _tests(
     found = {"sum of squares": (_square(flat) - freedom, deviation_of(max(freedom, 1e-300), spread))}
     if count < FEWEST_PIXELS:
         # What goes with the signal, or with the place, needs an image.
-        return _in_deviations(found)
+        return in_deviations(found)
     # Linear in the signal: every pixel's residual against the leading components of the fitted signal near by.
     s = images.around[:, good]
     _, size, vt = np.linalg.svd((s @ s.T).astype(float))
@@ -240,17 +240,11 @@ def _tests(
                 found[name] = (pairs.sum() - null, np.sqrt(_square(pairs)))
     # Tiles: mean residual of every row over patches of the image.
     found["patches"] = _patches(r, expected, spread)
-    return _in_deviations(found)
+    return in_deviations(found)
 
 
 def _square(x: NDArray[np.floating]) -> float:
     return float(np.sum(x**2, dtype=float))
-
-
-def _in_deviations(found: dict[str, tuple[float, float]]) -> tuple[dict[str, float], float]:
-    """Each test in standard deviations, and the most that one finds beyond two of them."""
-    left = max(chi2 - 2 * deviation for chi2, deviation in found.values())
-    return {k: float(chi2 / deviation) for k, (chi2, deviation) in found.items()}, max(float(left), 0.0)
 
 
 def _patches(r: NDArray[np.float32], expected: NDArray[np.float32], spread: float) -> tuple[float, float]:

@@ -1,8 +1,8 @@
-"""The posterior of all effects of an instrument at once, and the solution that a correction is made of."""
+"""The posterior of all effects of an instrument at once."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -13,20 +13,11 @@ from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.photon_noise import exactly_undone
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import causes
-from processing.diagnosis.search.descent import LEAST_WIDTH
-from processing.diagnosis.search.fit import Fit, Solution, held_out, minimize, prior, score
+from processing.diagnosis.search.correction import applied
+from processing.diagnosis.search.fit import Fit, prior, score
 from processing.diagnosis.search.likely_set import everything
 from processing.diagnosis.search.posterior import Posterior, Say, posterior
-from processing.diagnosis.search.rules import (
-    EXACT,
-    FAR_OFF,
-    LIKELY,
-    NEEDED,
-    SEEN,
-    SHARES,
-    TAKES_PART,
-)
+from processing.diagnosis.search.rules import EXACT, FAR_OFF, NEEDED, TAKES_PART
 from processing.diagnosis.search.space import Space
 from processing.instrument.elements import number
 from processing.instrument.model import InstrumentModel
@@ -45,6 +36,7 @@ class WholeBench:
     Attributes
     ----------
     whole : the problem with one set of unknowns for all states; `posterior` is found on it.
+    start : values by candidate to begin with.
     """
 
     def __init__(self, problem: InstrumentProblem, say: Say) -> None:
@@ -60,14 +52,14 @@ class WholeBench:
                 "could speak against the model. Take more states than the sample has unknowns, or a known sample."
             )
         branch = nearest_branch(self.whole, first_values(self.whole, self.base, self.pool, say))
-        self._start, self.branch = branch.values, branch.told
+        self.start, self.branch = branch.values, branch.told
         self._linearize_there()
 
     def _linearize_there(self) -> None:
         """Take the azimuths found for those of the model: a prior about far ones would widen with their distance."""
-        azimuths = [c for c in self._start if c in self.base.candidates and c.place.endswith("azimuth_deg")]
+        azimuths = [c for c in self.start if c in self.base.candidates and c.place.endswith("azimuth_deg")]
         space = Space(tuple(azimuths))
-        values = space.vector(self._start)
+        values = space.vector(self.start)
 
         def there(k: int, model: InstrumentModel) -> InstrumentModel:
             acting = space.acting(k, self.whole.wavelengths_nm[k])
@@ -82,7 +74,7 @@ class WholeBench:
         same = self.problem is self.whole
         self.whole = self.whole.with_models(models)
         self.problem = self.whole if same else self.problem.with_models(models)
-        self._start |= {c: np.zeros(c.size) for c in azimuths}
+        self.start |= {c: np.zeros(c.size) for c in azimuths}
 
     @property
     def train_is_off(self) -> bool:
@@ -91,7 +83,7 @@ class WholeBench:
             return False
         # With one channel a value for each state takes up any mistake.
         beside = len(self.whole.model.channels) > 1
-        start = {c: v for c, v in self._start.items() if beside or c in self.base.candidates}
+        start = {c: v for c, v in self.start.items() if beside or c in self.base.candidates}
         space = Space(tuple(start))
         values = space.vector(start)
         if not beside:
@@ -219,7 +211,7 @@ class WholeBench:
         return posterior(self.whole, space, fixed, self._values_at_start(space, old), say=self.say)
 
     def _values_at_start(self, space: Space, old: Posterior | None = None) -> Array:
-        start = dict(self._start)
+        start = dict(self.start)
         if old is not None:
             start |= old.space.split(old.values)
         return space.vector(start)
@@ -228,7 +220,7 @@ class WholeBench:
         """The switch that leaves clipped pixels out, if they say something else than the others."""
         for candidate in self.pool:
             if candidate.effect.is_switch and any(c.clipped.any() for c in self.whole.captures):
-                self._start[candidate] = np.ones(1)
+                self.start[candidate] = np.ones(1)
                 return [candidate]
         return []
 
@@ -253,57 +245,3 @@ class WholeBench:
             return found
         self.say(f"with {', '.join(c.label for c in fields)}")
         return self._posterior([*fixed, *plain, *fields], fixed)
-
-
-def applied(found: Posterior, base: Space, unfit: Collection[Candidate] = ()) -> tuple[Space, Array]:
-    """Space and values of the correction: the mean of the posterior, of what is likely enough to take part."""
-    keep = set(base.candidates)
-    by_label = {found.label(g): g for g in range(len(found.members))}
-    for cause in causes(found, 0.0):
-        # That one of a class is there can be certain while none of it is likely by itself: each gets its share.
-        if cause.probability >= LIKELY:
-            shares = [by_label[c] for c in cause.alternatives if found.samples.probability[by_label[c]] > SHARES]
-            keep |= {found.space.candidates[m] for g in shares for m in found.members[g]} | set(cause.candidates)
-    for g in _least_needed(found, keep):
-        keep |= {found.space.candidates[m] for m in found.members[g]}
-    keep -= set(unfit)
-    order = [*base.candidates, *(c for c in found.space.candidates if c in keep and c not in base.candidates)]
-    space = Space(tuple(order))
-    return space, space.vector(found.space.split(found.values))
-
-
-def _least_needed(found: Posterior, keep: Collection[Candidate]) -> list[int]:
-    """Groups beside those to `keep` that are likely enough to take part, and as many more as the fit would miss.
-
-    Several that are unlikely one by one can be one cause together: the mean has a part of each, which are nothing
-    without each other.
-    """
-    space, form = found.space, found.sets.form
-    order = np.argsort(-found.samples.probability)
-    kept = np.concatenate([np.zeros(0, dtype=bool), *(np.full(c.size, c in keep) for c in space.candidates)])
-    mean = found.values / space.joined("typical")
-    told = form.at(mean)
-    out: list[int] = []
-    for g in order:
-        left = form.at(np.where(kept, mean, 0.0)) - told
-        if found.samples.probability[g] <= TAKES_PART and left <= SEEN * found.samples.best.unit:
-            break
-        out.append(int(g))
-        for m in found.members[g]:
-            kept[space.slices[m]] = True
-    return out
-
-
-def solution(bench: WholeBench, found: Posterior) -> Solution:
-    """The correction of a posterior, and how well it predicts what it did not see."""
-    asked = predicts(bench.problem)
-    base_fit = minimize(asked, bench.base, bench.base.vector(bench._start))
-    before = held_out(asked, bench.base, base_fit)
-    space, values = applied(found, bench.base, bench.as_many_as_intensities(found, SHARES))
-    asked.relinearize(space, values)
-    sums = asked.sums(space, values)
-    fit = Fit(values, sums, float(sums.excess.sum()))
-    typical = space.joined("typical")
-    spread = space.vector(found.space.split(np.diag(found.covariance)))
-    weak = found.samples.best.unit / np.maximum(np.sqrt(spread + values**2), LEAST_WIDTH * typical) ** 2
-    return Solution(bench.base, base_fit, before, space, fit, held_out(asked, space, fit, weak), weak)

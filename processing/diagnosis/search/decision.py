@@ -175,3 +175,9 @@ def beyond_chance(tests: Mapping[str, float]) -> dict[str, float]:
     in_order = sorted(tests.items(), key=lambda item: -item[1])
     two = dict(item for item in in_order if item[1] > LIMIT_OF_TWO)
     return two if len(two) > 1 else dict(item for item in in_order if item[1] > LIMIT)
+
+
+def in_deviations(found: dict[str, tuple[float, float]]) -> tuple[dict[str, float], float]:
+    """Tests in standard deviations, of their chi-square beyond noise and its deviation, and the most beyond two."""
+    left = max(chi2 - 2 * deviation for chi2, deviation in found.values())
+    return {k: float(chi2 / deviation) for k, (chi2, deviation) in found.items()}, max(float(left), 0.0)

@@ -283,6 +283,11 @@ class Solution:
         return self.space.candidates[len(self.base.candidates) :]
 
     @property
+    def ends(self) -> tuple[tuple[Space, Fit], tuple[Space, Fit]]:
+        """Space and fit before and after."""
+        return (self.base, self.before_fit), (self.space, self.fit)
+
+    @property
     def undone(self) -> Solution:
         """Nothing corrected."""
         return Solution(self.base, self.before_fit, self.before, self.base, self.before_fit, self.before)

@@ -157,13 +157,6 @@ OUTSTANDING = 4.0
 #: [sine] Of the angle between two signatures, from which on a capture tells them apart.
 APART = 0.3
 
-# ---- surfaces ------------------------------------------------------------------------------------------------------
-#: [log odds] That a group needs: smooth patterns over an object imitate each other.
-IMITATES = 20.0
-#: [of what is left over] What a group must explain to be added while structure is left: several that each take a little
-#: together imitate nearly any smooth pattern.
-EXPLAINS = 0.3
-
 # ---- effort: what a search may cost --------------------------------------------------------------------------------
 #: [rounds] Times that the problem is linearized anew about its solution.
 ROUNDS = 7

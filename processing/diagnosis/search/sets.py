@@ -217,11 +217,6 @@ class Sets:
         """Posterior of the parameters that are there."""
         return self._solved(state)[0]
 
-    def score_at(self, state: State, unit: float) -> float:
-        """Log probability of a set with a given unit of chi-square, a constant left out."""
-        fit = self.fitted(State(state.tau, unit))
-        return fit.score - self.noise.log_likelihood(fit.left) - 0.5 * fit.left / unit
-
     def _left(self, state: State) -> float:
         """Excess that a set leaves, what the prior takes included."""
         active, _, lower = self._factored(state)
@@ -276,14 +271,6 @@ class Sets:
         there = (state.tau > 0) & self.free
         log_odds = np.where(self.free, log_odds + self.prior_odds(there), np.inf)
         return Conditional(**vars(fit), log_odds=log_odds, tau_weights=weights)
-
-    def given_others(self, state: State) -> dict[int, tuple[Array, Array]]:
-        """Curvature (n, n) and gradient (n,) about zero of every group that may be absent, given the others."""
-        return {
-            int(k): (s[j], q[j])
-            for members, s, q in self._cavities(state, *self._solved(state))
-            for j, k in enumerate(members)
-        }
 
     def _cavities(
         self, state: State, fit: Fitted, inverse: Array, right: Array

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.decision import in_deviations
 from processing.diagnosis.search.range_of import range_of, rank_of
 from processing.diagnosis.search.rules import FEWEST_OF_MANY
 from processing.diagnosis.search.space import Space, Sums
@@ -31,6 +32,8 @@ from processing.reflectance.effects.base import ReflectanceEffect, reflectance_e
 STEP = 1e-4
 #: [patterns, fixed] Smooth ones over an object that a misfit can have: up to second order in the position.
 PATTERNS = 6
+#: Tests of the residual: what some Mueller matrix could cause, and what none could.
+SMOOTH, OF_INSTRUMENT = "smooth over the object", "smooth over the object, of the instrument"
 #: [of the modelled light] Part of it that has to be polarized before it counts as a second column.
 LEAST_POLARIZED = 1e-6
 
@@ -96,7 +99,7 @@ class SurfaceProblem:
         """The captures with the pixels that can speak; those without enough of them are left out."""
         out = []
         for k, data in enumerate(self.captures):
-            w = self.rows(k, self.changes(k, Space(()), np.zeros(0))[0])
+            w = self.rows(k, Space(()), np.zeros(0))
             here = data.kept(data.polarized(w[:, 0]))
             if len(here.y) >= FEWEST_OF_MANY:
                 out.append(here)
@@ -130,7 +133,7 @@ class SurfaceProblem:
         """Rows that the unknowns leave over, and equal power of the smooth patterns that a misfit can have."""
         out = []
         for k in range(len(self.captures)):
-            w = self.rows(k, self.changes(k, Space(()), np.zeros(0))[0])
+            w = self.rows(k, Space(()), np.zeros(0))
             out.append((max(rank_of(w) - 2, 1), np.ones(PATTERNS)))
         return out
 
@@ -149,15 +152,24 @@ class SurfaceProblem:
                 candidate.apply(optics, self.model, values[part])
         return optics, surface
 
-    def rows(self, capture: int, changes: Changes) -> Array:
-        """W (L, 16) of a capture."""
+    def noise_floor(self, space: Space, values: Array, k: int | None = None) -> float:
+        """Rms noise over the mean signal, of one capture or of all; no effect changes it."""
+        captures = self.captures if k is None else self.captures[k : k + 1]
+        return float(np.sqrt(np.mean([np.mean(c.variance) / np.mean(c.y) ** 2 for c in captures])))
+
+    def rows(self, k: int, space: Space, values: Array) -> Array:
+        """Measurement matrix W (L, 16) of a capture."""
+        return self.rows_of(k, self.changes(k, space, values)[0])
+
+    def rows_of(self, capture: int, changes: Changes) -> Array:
+        """The same of the changes of a capture."""
         data = self.captures[capture]
         return self.model.rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.exposure[:, None]
 
     def _columns(self, k: int, space: Space, values: Array) -> tuple[Array, Array, Array]:
         """Both columns and the light from elsewhere, each (P, L), in units of the noise."""
         optics, surface = self.changes(k, space, values)
-        w, data = self.rows(k, optics), self.captures[k]
+        w, data = self.rows_of(k, optics), self.captures[k]
         columns = data.view.dominant(surface).reshape(-1, 16) @ w.T / self.sigma[k]
         extra = data.view.extra(surface)
         light = np.zeros_like(columns) if extra is None else extra.reshape(-1, 16) @ w.T / self.sigma[k]
@@ -209,23 +221,26 @@ class SurfaceProblem:
 
     def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
         """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
-        out = Sums.empty(self.folds, space.size if derivatives else 0)
+        size = space.size if derivatives else 0
+        out = Sums.empty(self.folds, size, len(self.captures))
         for k, data in enumerate(self.captures):
-            here = self.pixels(k, space, values)
+            part, here = Sums.empty(self.folds, size), self.pixels(k, space, values)
             expected = np.sum(here.free * self.noise[k], axis=1)
-            np.add.at(out.excess, data.fold, np.sum(here.residual**2, axis=1) - expected)
-            np.add.at(out.freedom, data.fold, expected)
             square = np.sum((here.residual * self.sigma[k]) ** 2, axis=1) / float(np.mean(data.y)) ** 2
-            np.add.at(out.square, data.fold, square)
-            np.add.at(out.count, data.fold, here.free.sum(axis=1))
-            if not derivatives or not space.size:
-                continue
-            d, less = self.derivatives(k, space, values, here)
-            for fold in range(self.folds):
-                mine = d[:, data.fold == fold].reshape(space.size, -1)
-                out.gradient[fold] += mine @ here.residual[data.fold == fold].reshape(-1)
-                out.gradient[fold] -= less[:, data.fold == fold].sum(axis=1) / 2
-                out.curvature[fold] += mine @ mine.T
+            for total, each in (
+                (part.excess, np.sum(here.residual**2, axis=1) - expected),
+                (part.freedom, expected),
+                (part.square, square),
+                (part.count, here.free.sum(axis=1)),
+            ):
+                np.add.at(total, data.fold, each)
+            d, less = self.derivatives(k, space, values, here) if size else (np.zeros((0, *here.residual.shape)),) * 2
+            for fold in range(self.folds if size else 0):
+                mine = d[:, data.fold == fold].reshape(size, -1)
+                part.gradient[fold] = mine @ here.residual[data.fold == fold].reshape(-1)
+                part.gradient[fold] -= less[:, data.fold == fold].sum(axis=1) / 2
+                part.curvature[fold] = mine @ mine.T
+            out.add(k, part, space.acting(k, data.wavelength_nm))
         return out
 
     def derivatives(self, k: int, space: Space, values: Array, here: SurfacePixels) -> tuple[Array, Array]:
@@ -282,26 +297,28 @@ def _left(full: Array, tile: NDArray[np.int64]) -> Array:
     return np.asarray(hold * (1 - hold * full**2 / weight))
 
 
-def structure(problem: SurfaceProblem, k: int, space: Space, values: Array) -> dict[str, float]:
-    """Tests of a capture's residual: name to standard deviations from what noise gives.
+def structure(problem: SurfaceProblem, k: int, space: Space, values: Array) -> tuple[dict[str, float], float]:
+    """Tests of a capture's residual: name to standard deviations from what noise gives; and the chi-square left.
 
     Sums over tiles of the object, split into what some Mueller matrix could cause and what none could, which speaks
     against the instrument's model and not against the reflectance.
     """
     here, data = problem.pixels(k, space, values), problem.captures[k]
     r, noise = here.residual, problem.noise[k] * here.free
-    out = {"sum of squares": float((np.sum(r**2) - noise.sum()) / np.sqrt(2 * noise.sum()))}
-    w = problem.rows(k, problem.changes(k, space, values)[0]) / np.mean(problem.sigma[k], axis=0)[:, None]
-    basis = range_of(w)
+    found = {"sum of squares": (float(np.sum(r**2) - noise.sum()), float(np.sqrt(2 * noise.sum())))}
+    basis = range_of(problem.rows(k, space, values) / np.mean(problem.sigma[k], axis=0)[:, None])
     rows, rank = basis.shape
     tiles = np.unique(data.tile)
     totals = np.stack([r[data.tile == t].sum(axis=0) for t in tiles])
     level = np.array([noise[data.tile == t].sum() for t in tiles]) / (rows - 2)
     inside = np.sum((totals @ basis) ** 2)
     for name, square, directions in (
-        ("smooth over the object", inside, rank - 2),
-        ("smooth over the object, of the instrument", np.sum(totals**2) - inside, rows - rank),
+        (SMOOTH, inside, rank - 2),
+        (OF_INSTRUMENT, np.sum(totals**2) - inside, rows - rank),
     ):
         if directions > 0:
-            out[name] = float((square - directions * level.sum()) / np.sqrt(2 * directions * np.sum(level**2)))
-    return out
+            # Sums over as many pixels as a tile has count as one.
+            size = len(r) / tiles.size
+            deviation = np.sqrt(2 * directions * np.sum(level**2))
+            found[name] = float(square - directions * level.sum()) / size, float(deviation) / size
+    return in_deviations(found)

@@ -1,11 +1,14 @@
-"""What a model of the reflectance makes of a capture: psi and |D| of the dominant process, and xi0."""
+"""psi and |D| of the dominant process and xi0 by a model of the reflectance, and what a correction does to xi0."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from processing.arrays import Array
+from processing.diagnosis.search.decision import PredictedChange, chance_checks
+from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.range_of import rank_of
+from processing.diagnosis.search.result import Check
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfacePixels, SurfaceProblem
 from processing.polarization.cloude import xi0_and_dominant
@@ -70,10 +73,49 @@ def dominant_errors(
 ) -> tuple[Array, Array] | None:
     """Modelled less measured psi (degrees) and |D| (percent) of each pixel (P,); None if W has not rank 16."""
     optics, surface = problem.changes(k, space, values)
-    w = problem.rows(k, optics)
+    w = problem.rows_of(k, optics)
     if rank_of(w) < 16:
         return None
     _, m0 = xi0_and_dominant((y @ np.linalg.pinv(w).T).reshape(-1, 4, 4))
     measured, modelled = (linear_diattenuation(m) for m in (m0, problem.captures[k].view.dominant(surface)))
     psi = np.rad2deg(orientation_difference(modelled, measured))
     return np.asarray(psi, dtype=float), np.asarray(100 * (magnitude(modelled) - magnitude(measured)), dtype=float)
+
+
+def chances(problem: SurfaceProblem, solved: Solution, covariance: Array) -> tuple[Check, ...]:
+    """What the correction does to xi0, where its values have a covariance (K, K); none where no pixel shows xi0."""
+    if not solved.effects:
+        return ()
+    change = change_of_xi0(problem, solved, covariance)
+    return () if change is None else chance_checks("xi0", change)
+
+
+def change_of_xi0(problem: SurfaceProblem, solved: Solution, covariance: Array) -> PredictedChange | None:
+    """The change of xi0 and its error, which is that at both ends of every principal axis of the values.
+
+    Slopes at what was found do not tell it: the model is far from linear, and values have bounds.
+    """
+    space, values = solved.space, solved.fit.values
+    found = _all_xi0(problem, space, values)
+    change = found - _all_xi0(problem, space, np.zeros(space.size))
+    if not np.isfinite(change).any():
+        return None
+    size = float(np.sqrt(_mean(change**2)))
+    along, whole = 0.0, 0.0
+    lower, upper = space.joined("lower"), space.joined("upper")
+    variance, axes = np.linalg.eigh(covariance)
+    for one in (np.sqrt(np.maximum(variance, 0.0)) * axes).T:
+        ends = [_all_xi0(problem, space, np.clip(values + sign * one, lower, upper)) - found for sign in (1, -1)]
+        whole += sum(_mean(end**2) for end in ends) / 2
+        along += sum(_mean(end * change) ** 2 for end in ends) / 2 / max(size, 1e-300) ** 2
+    return PredictedChange(float(np.hypot(size, np.sqrt(whole))), float(np.sqrt(whole)), size, size, float(along**0.5))
+
+
+def _all_xi0(problem: SurfaceProblem, space: Space, values: Array) -> Array:
+    return np.concatenate([xi0_of(problem, k, space, values) for k in range(len(problem.captures))])
+
+
+def _mean(x: Array) -> float:
+    """Over the pixels that show xi0."""
+    shown = x[np.isfinite(x)]
+    return float(shown.mean()) if shown.size else 0.0

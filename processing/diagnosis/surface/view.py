@@ -35,8 +35,8 @@ EVERY = 13
 ON_EDGE = 1e-6
 #: [rad, fixed] Turn from one part of a disc to the next that spreads them evenly.
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
-#: [answers] That are kept of each kind; a fit changes one value at a time.
-KEPT = 8
+#: [answers] That are kept of each kind: a fit changes one value of many at a time.
+KEPT = 64
 #: [steps] Of theta_h in which the polarized light of a surface is learnt from its own pixels.
 BINS = 16
 

@@ -1,0 +1,84 @@
+"""Names of causes, and why what is left over puts some of them in doubt."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.causes import Answer, Cause
+from processing.diagnosis.search.posterior import Posterior
+from processing.diagnosis.search.rules import BOUND, CERTAIN, LIKELY, SURE, TIMES
+
+AT_BOUND = "a value stands at its bound: the data ask for something else"
+#: Reasons that leave a name likely.
+PART_OF_LEFT = "it may be a part of what is left unexplained"
+PART_OF_UNLISTED = "it may be a part of the fault that has no name"
+PARTS = (PART_OF_LEFT, PART_OF_UNLISTED)
+
+
+@dataclass(frozen=True)
+class Names:
+    """Causes that are told.
+
+    Attributes
+    ----------
+    named : likely ones; doubt : why some of them have no sure name.
+    untold : as many values as the data have, which have no name at all.
+    """
+
+    named: tuple[Cause, ...]
+    doubt: Mapping[Cause, str]
+    untold: tuple[Cause, ...] = ()
+
+    @property
+    def sure(self) -> list[Cause]:
+        """Those that nothing speaks against."""
+        return [c for c in self.named if c.answer != "unknown" and c not in self.doubt]
+
+    @property
+    def rivals(self) -> list[tuple[Candidate, ...]]:
+        """Sets of effects of which one is there."""
+        return [(c.candidates[0], *c.others) for c in self.named if c.others]
+
+
+def with_parts(
+    found: Posterior, causes: Sequence[Cause], doubt: Mapping[Cause, str], *, left: float, noise_known: bool
+) -> dict[Cause, str]:
+    """Reasons of doubt by cause, with those of being a part of something else.
+
+    `left` is the chi-square of structure.
+    """
+    out = dict(doubt)
+    for rank, cause in enumerate(causes, 1):
+        if noise_known:
+            weak = 2 * cause.log_odds * found.samples.best.unit < TIMES * rank**2 * left
+        else:
+            general = cause.candidates[0].effect.per_state or cause.candidates[0].is_pointwise
+            rest = found.sets.noise.directions if general else 0.0
+            weak = cause.log_odds < max(CERTAIN, TIMES * rest / 2)
+        if cause not in out and weak:
+            out[cause] = PART_OF_LEFT
+    # A sentence is a part of an unknown mechanism, whose other parts look like effects of the list.
+    unlisted = [k for k in range(len(found.members)) if found.label(k).price]
+    if found.samples.any_of(unlisted) > 0.5:
+        out |= {cause: PART_OF_UNLISTED for cause in causes if cause not in out and cause.answer != "unlisted"}
+    return out
+
+
+def at_bound(cause: Cause) -> bool:
+    """Whether a value of a cause stands at the end of its range."""
+    for candidate, values in zip(cause.candidates, cause.values, strict=True):
+        width = candidate.upper - candidate.lower
+        if (((values - candidate.lower) < BOUND * width) | ((candidate.upper - values) < BOUND * width)).any():
+            return True
+    return False
+
+
+def told_answer(cause: Cause, doubt: str | None) -> tuple[Answer, float]:
+    """The word for a cause and its probability: what may be a part of something else is not sure, what is doubted for
+    another reason is not told."""
+    if doubt is None:
+        return cause.answer, cause.probability
+    probability = min(cause.probability, LIKELY)
+    if doubt not in PARTS or cause.probability < SURE:
+        return "unknown", probability
+    return "one of" if cause.alternatives else "unlisted" if cause.candidates[0].price else "likely", probability

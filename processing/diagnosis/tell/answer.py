@@ -1,0 +1,399 @@
+"""The parts of an answer as they are stored: causes, correction, and what cannot be seen."""
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+
+from processing.arrays import Array
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.causes import Cause, information, shown, wanted_for_evidence
+from processing.diagnosis.search.decision import Judgement, held_out_check, refusal, rows_checks
+from processing.diagnosis.search.fit import HeldOut, Solution
+from processing.diagnosis.search.names import Names, told_answer
+from processing.diagnosis.search.posterior import Posterior
+from processing.diagnosis.search.result import (
+    BeyondNoise,
+    CaptureReport,
+    Check,
+    Combination,
+    Correction,
+    Error,
+    FoundEffect,
+    MuellerError,
+    Ranked,
+    Unexplained,
+)
+from processing.diagnosis.search.rules import MOST_RANKED, MOST_TRIED, NEEDED, SEEN, SMALL
+from processing.diagnosis.search.space import Problem, Space
+from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
+from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel, SystematicError
+
+#: [correlation] From which on two values are told together.
+TOGETHER = 0.9
+#: [1] Ratio of the largest to the least error among the directions of values that are told together.
+OPEN = 5.0
+
+
+class Captured(Protocol):
+    """What is told of every capture."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def simulated(self) -> bool: ...
+    @property
+    def wavelength_nm(self) -> float: ...
+
+
+class Asked(Problem, Protocol):
+    """A problem that an answer belongs to; `held_out` says in words what is predicted by what."""
+
+    model: InstrumentModel
+
+    @property
+    def captures(self) -> Sequence[Captured]: ...
+    @property
+    def held_out(self) -> str: ...
+
+    def noise_floor(self, space: Space, values: Array, k: int | None = None) -> float:
+        """Rms noise over the mean signal, of one capture or of all, with the counts corrected by these values."""
+        ...
+
+    def rows(self, k: int, space: Space, values: Array) -> Array:
+        """Measurement matrix W (L, 16) of a capture."""
+        ...
+
+
+@dataclass(frozen=True)
+class Tie:
+    """Values `index` (n,) of which weights @ values is determined to `stderr`; `open_by` (n,) is one standard deviation
+    of the direction that is determined least. The largest weight is one."""
+
+    index: NDArray[np.int64]
+    weights: Array
+    value: float
+    stderr: float
+    open_by: Array
+
+
+def ties(values: Array, covariance: Array, typical: Array) -> Iterator[Tie]:
+    """Groups of values (K,) that are known together much better than each by itself, of their covariance (K, K)."""
+    error = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    alike = np.abs(covariance / np.outer(error, error)) > TOGETHER
+    count, group = connected_components(alike, directed=False)
+    for k in range(count):
+        index = np.flatnonzero(group == k)
+        if index.size < 2:
+            continue
+        size, vector = np.linalg.eigh(covariance[np.ix_(index, index)] / np.outer(typical[index], typical[index]))
+        if size[-1] < OPEN**2 * max(size[0], 0.0):
+            continue
+        weights = vector[:, 0] / typical[index]
+        weights = weights / weights[np.argmax(np.abs(weights * error[index]))]
+        variance = weights @ covariance[np.ix_(index, index)] @ weights
+        yield Tie(
+            index,
+            weights,
+            float(weights @ values[index]),
+            float(np.sqrt(max(variance, 0.0))),
+            vector[:, -1] * np.sqrt(size[-1]) * typical[index],
+        )
+
+
+def combinations(found: Posterior, solved: Solution) -> tuple[Combination, ...]:
+    """Of the values of a correction, those that are only known together."""
+    effects = set(solved.effects)
+    at: list[int] = []
+    names: list[str] = []
+    units: list[str] = []
+    for candidate, part in found.space.pairs:
+        if candidate in effects and not candidate.effect.per_state:
+            at += range(part.start, part.stop)
+            single = candidate.size == 1
+            names += [candidate.label if single else f"{candidate.label} {p.name}" for p in candidate.parameters]
+            units += [p.unit for p in candidate.parameters]
+    typical = found.space.joined("typical")[at]
+    told = []
+    for tie in ties(found.values[at], found.covariance[np.ix_(at, at)], typical):
+        first = int(tie.index[np.argmin(np.abs(tie.weights - 1))])
+        told.append(
+            Combination(
+                weights={names[i]: float(w) for i, w in zip(tie.index, tie.weights, strict=True)},
+                value=tie.value,
+                stderr=tie.stderr,
+                unit=units[first],
+                open_by={names[i]: float(v) for i, v in zip(tie.index, tie.open_by, strict=True)},
+            )
+        )
+    return tuple(told)
+
+
+def error(problem: Asked, solved: Solution, out: HeldOut, k: int | None = None) -> Error:
+    """A residual as it is told, of one capture `k` or of all, in the unit of the counts as they were taken."""
+    noise, rms, beyond = floor(problem, solved, k), 100 * out.rms, None
+    if noise is not None:
+        rms /= 1.0 if out is solved.before else stretch(problem, solved, k)
+        beyond = BeyondNoise.of(out.excess, out.freedom, noise)
+    return Error(rms_percent=rms, chi2_reduced=out.chi2_reduced, held_out=problem.held_out, beyond_noise=beyond)
+
+
+def floor(problem: Asked, solved: Solution, k: int | None = None) -> float | None:
+    """Rms noise over the mean signal, percent, of the counts as they were taken: of one capture or of all."""
+    if not problem.noise_known:
+        return None
+    return 100 * problem.noise_floor(solved.base, solved.before_fit.values, k)
+
+
+def stretch(problem: Asked, solved: Solution, k: int | None = None) -> float:
+    """By how much a bend of the response that is undone stretches noise, and residual, relative to the signal."""
+    if not problem.noise_known:
+        return 1.0
+    taken = problem.noise_floor(solved.base, solved.before_fit.values, k)
+    return problem.noise_floor(solved.space, solved.fit.values, k) / taken if taken > 0 else 1.0
+
+
+def left_without(problem: Asked, solved: Solution, effects: Collection[Candidate]) -> HeldOut:
+    """What the correction would leave without some of its effects; for each degree of freedom, as after it."""
+    values = solved.fit.values.copy()
+    for candidate, part in solved.space.pairs:
+        if candidate in effects:
+            values[part] = 0.0
+    sums = problem.sums(solved.space, values, derivatives=False)
+    more = float(sums.excess.sum()) - solved.fit.excess
+    return solved.after.and_more(more, float(sums.square.sum() - solved.fit.sums.square.sum()))
+
+
+def told_effects(
+    problem: Asked, solved: Solution, cause: Cause, doubt: str | None, *, not_applied: str | None
+) -> list[FoundEffect]:
+    """A cause as it is told, given a reason to doubt it; one for each capture in which it shows."""
+    without = left_without(problem, solved, (*cause.candidates, *cause.alternatives))
+    if not any(c in solved.space.candidates for c in (*cause.candidates, *cause.alternatives)):
+        not_applied = not_applied or doubt or "it is not needed in addition to the other causes"
+    answer, probability = told_answer(cause, doubt)
+    told = []
+    # Of one with values of its own in every capture, those captures are told in which it shows.
+    each = [
+        at
+        for found in zip(cause.candidates, cause.values, cause.covariance, strict=True)
+        for at in by_wavelength(*found)
+    ]
+    sizes = [shown(values, covariance) for _, values, covariance in each]
+    for (candidate, values, covariance), size in zip(each, sizes, strict=True):
+        if size < min(1.0, max(sizes)):
+            continue
+        told.append(
+            FoundEffect(
+                kind=candidate.kind,
+                element=candidate.place or None,
+                parameters=parameters_of(candidate, values, np.sqrt(np.diag(covariance))),
+                evidence=2 * cause.log_odds,
+                indistinguishable_from=tuple(dict.fromkeys(c.short for c in cause.alternatives)),
+                scope=scope_of(candidate),
+                capture=None if candidate.capture is None else problem.captures[candidate.capture].name,
+                wavelength_nm=candidate.wavelength_nm,
+                removal_chance=1 - probability,
+                confident=doubt is None and cause.answer not in ("unknown", "unlisted"),
+                probability=probability,
+                answer=answer,
+                residual_without=error(problem, solved, without),
+                residual_with=error(problem, solved, solved.after),
+                not_applied=not_applied,
+            )
+        )
+    return told
+
+
+def told_switches(problem: Asked, solved: Solution) -> list[FoundEffect]:
+    """Pixels that are left out because what they say is another thing than the others say."""
+    told = []
+    for candidate, part in solved.space.pairs:
+        if candidate.effect.is_switch:
+            value, never = solved.fit.values[part], np.zeros((1, 1))
+            gain = left_without(problem, solved, (candidate,)).excess - solved.after.excess
+            cause = Cause((candidate,), (value,), (never,), probability=1.0, log_odds=gain / 2, alternatives=())
+            told += told_effects(problem, solved, cause, None, not_applied=None) if gain > 2 * NEEDED else []
+    return told
+
+
+def _wavelength(problem: Asked, candidate: Candidate) -> float | None:
+    """Wavelength at which the values hold; None for all of them."""
+    several = {c.wavelength_nm for c in problem.captures}
+    effect = candidate.of_instrument
+    if effect and problem.model.belongs_to.get(candidate.kind, effect.belongs_to) == "mechanics":
+        return None
+    if candidate.capture is not None:
+        return problem.captures[candidate.capture].wavelength_nm
+    return several.pop() if len(several) == 1 else candidate.wavelength_nm
+
+
+def ranking(found: Posterior, before: HeldOut) -> tuple[Ranked, ...]:
+    """Groups by what each would explain alone."""
+    form, groups = found.sets.form, found.sets.groups
+    total = max(before.excess + before.freedom, 1e-300)
+    alone = []
+    for k in np.flatnonzero(found.sets.free):
+        g, h = form.gradient[groups[k].index], form.curvature[np.ix_(groups[k].index, groups[k].index)]
+        alone.append((float(g @ np.linalg.solve(h + np.eye(g.size), g)), int(k)))
+    return tuple(
+        Ranked(
+            candidate=found.label(k).label,
+            evidence=round(gain, 1),
+            rms_percent=100 * before.rms * float(np.sqrt(max(1 - gain / total, 0.0))),
+        )
+        for gain, k in sorted(alone, reverse=True)[:MOST_RANKED]
+    )
+
+
+def unobservable(problem: Asked, found: Posterior) -> list[Candidate]:
+    """Candidates about which the captures say nothing, the nominal values being free."""
+    told, always = information(found)
+    out = []
+    for candidate, part in found.space.pairs:
+        if candidate.state_chosen or candidate.effect.is_switch or np.isin(part.start, always):
+            continue
+        least = np.full(candidate.size, SEEN)
+        if candidate.reaches_around:
+            # Noise alone has slopes too, from one pixel to the next, which a shift would change.
+            one = Space((candidate,))
+            noise = np.diag(problem.noise_information(one, np.zeros(one.size))) * candidate.typical**2
+            least = np.maximum(least, SMALL * noise)
+        if np.all(told[part] < least):
+            out.append(candidate)
+    return out
+
+
+def checks(problem: Asked, solved: Solution) -> tuple[Check, ...]:
+    """Held-out residual, rank and condition of W, before and after: if one gets worse, it is no explanation."""
+    out = [held_out_check(solved, stretch(problem, solved))]
+    several = len(problem.captures) > 1
+    for k, data in enumerate(problem.captures):
+        if several:
+            # The sum decides; what became of each is told also where nothing is written.
+            old, new = (100 * found.of(k).rms for found in (solved.before, solved.after))
+            name = f"rms on held-out data of {data.name} at {data.wavelength_nm:g} nm, percent"
+            out.append(Check(name=name, before=old, after=new, holds=True))
+        before, after = (problem.rows(k, space, fit.values) for space, fit in solved.ends)
+        out += rows_checks(data.name, before, after)
+    return tuple(out)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A posterior with its correction, names and judgement; `switched` are causes that are on or off.
+
+    `problem` is what the correction predicts.
+    """
+
+    problem: Asked
+    found: Posterior
+    solved: Solution
+    names: Names
+    judgement: Judgement
+    switched: Sequence[FoundEffect] = ()
+
+    @property
+    def any_cause(self) -> bool:
+        """Whether anything was found, with a name or without."""
+        return self.judgement.named or bool(self.names.untold)
+
+    @property
+    def kept(self) -> Solution:
+        """What is applied."""
+        return self.judgement.kept(self.solved, self.any_cause)
+
+    def told(
+        self,
+        *,
+        recommended: Callable[[], str],
+        descriptions: Sequence[str],
+        captures: Sequence[CaptureReport],
+        unseen: Sequence[Candidate],
+        calibrated: dict[str, EffectParameter],
+        lasts: bool,
+        uncertain: tuple[SystematicError, MuellerError] | None = None,
+    ) -> dict[str, Any]:
+        """Fields of a `Diagnosis`.
+
+        Parameters
+        ----------
+        recommended : says what to do next where something could be seen.
+        descriptions : sentences about what is left over.
+        unseen : what these captures cannot show.
+        lasts : whether the correction may be used for later captures.
+        uncertain : how wrong M may be still.
+        """
+        problem, solved, kept, names = self.problem, self.solved, self.kept, self.names
+        verdict, ranked = self.judgement.verdict, ranking(self.found, solved.before)
+        # What makes the residual worse is no cause, however well it fits.
+        worse, refused = refusal(self.judgement.figures), self.judgement.refused
+        tried = tuple(c.candidates[0].label for c in names.named)
+        return {
+            "verdict": verdict,
+            "error_before": error(problem, solved, solved.before),
+            "error_after": error(problem, kept, kept.after),
+            "noise_floor_percent": floor(problem, kept),
+            "effects": (
+                *(
+                    e
+                    for c in names.named
+                    for e in told_effects(problem, solved, c, worse or names.doubt.get(c), not_applied=refused)
+                ),
+                *self.switched,
+            ),
+            "unobservable": (
+                *dict.fromkeys(c.short for c in unseen),
+                *(f"{c.candidates[0].short} (as many values as the data have)" for c in names.untold),
+            ),
+            "recommendation": wanted_for_evidence(problem) if verdict == "undetermined" else recommended(),
+            "unexplained": Unexplained(
+                description=tuple(descriptions), tried=tried or tuple(r.candidate for r in ranked[:MOST_TRIED])
+            )
+            if verdict in ("unexplained", "partly_explained")
+            else None,
+            "calibrated": calibrated,
+            "ranking": ranked,
+            "captures": tuple(captures),
+            "instrument": problem.model.name,
+            "wavelengths_nm": tuple(sorted({c.wavelength_nm for c in problem.captures})),
+            "simulated": any(c.simulated for c in problem.captures),
+            "correction": self._correction(lasts, uncertain),
+        }
+
+    def _correction(self, lasts: bool, uncertain: tuple[SystematicError, MuellerError] | None) -> Correction:
+        """What a file would hold: means, with the spread over the sets; for these captures alone unless it `lasts`."""
+        found, solved, captures = self.found, self.solved, self.problem.captures
+        part = dict(found.space.pairs)
+        chance = {
+            found.space.candidates[m]: p for g, p in enumerate(found.samples.probability) for m in found.members[g]
+        }
+        effects = []
+        for candidate, where in solved.space.pairs if self.any_cause else ():
+            if candidate in solved.base.candidates:
+                continue
+            covariance = found.covariance[part[candidate], part[candidate]]
+            for one, values, own in by_wavelength(candidate, solved.fit.values[where], covariance):
+                effects.append(
+                    AppliedEffect(
+                        kind=one.kind,
+                        element=one.place or None,
+                        parameters=parameters_of(one, values, np.sqrt(np.maximum(np.diag(own), 0.0))),
+                        probability=float(chance[candidate]),
+                        captures=tuple(c.name for k, c in enumerate(captures) if one.acts(k, c.wavelength_nm)),
+                        scope=scope_of(one) if lasts else "capture",
+                        wavelength_nm=_wavelength(self.problem, one),
+                    )
+                )
+        stored, mueller = uncertain or (None, None)
+        return Correction(
+            effects=tuple(effects),
+            systematic=stored,
+            mueller=mueller,
+            combinations=combinations(found, solved) if self.any_cause else (),
+            checks=self.judgement.checks,
+            refused=self.judgement.refused,
+        )
