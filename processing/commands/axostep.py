@@ -17,6 +17,7 @@ def register(app: typer.Typer) -> None:
 
 
 def from_axostep_command(
+    *,
     sources: Annotated[
         list[Path],
         typer.Argument(
@@ -39,7 +40,10 @@ def from_axostep_command(
         facts, is_unchanged = product_of_axostep(source, target, wavelength_nm, omega_deg, overwrite=overwrite)
         return Made((target,), is_unchanged, "".join(f"  {fact}" for fact in facts))
 
-    run_batch("reading", "files", inputs, make, lambda made: typer.echo(f"{made.facts.strip()}\n{made.paths[0]}"))
+    def print_result(made: Made) -> None:
+        typer.echo(f"{made.facts.strip()}\n{made.paths[0]}")
+
+    run_batch("reading", "files", inputs, make, print_result=print_result)
 
 
 def to_axostep_command(

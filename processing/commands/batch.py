@@ -34,6 +34,7 @@ def run_batch(
     unit: str,
     inputs: Sequence[Path],
     make: Callable[[Path, Progress], Made],
+    *,
     print_result: Callable[[Made], None] | None = None,
     word: str = "made",
 ) -> None:
@@ -143,7 +144,7 @@ def make_products(
         summary(made.paths[0])
         draw(made.paths[0], figure, no_figure)
 
-    run_batch(what, unit, inputs, make, print_result)
+    run_batch(what, unit, inputs, make, print_result=print_result)
 
 
 def place_for(inputs: Sequence[Path], out: Path | None) -> Callable[[Path], Path]:

@@ -21,6 +21,7 @@ def register(app: typer.Typer) -> None:
 
 
 def calibrate_command(
+    *,
     captures: Annotated[
         list[Path], typer.Argument(help="Captures of air, a mirror or another known sample, at any wavelengths.")
     ],

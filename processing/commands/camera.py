@@ -16,6 +16,7 @@ def register(app: typer.Typer) -> None:
 
 
 def camera_command(
+    *,
     captures: Annotated[list[Path], typer.Argument(help="Captures with dark states and with repeated states.")],
     out: Annotated[Path | None, typer.Option(help="Product file; default: beside the first capture.")] = None,
     figure: FigureFile = None,

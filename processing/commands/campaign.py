@@ -23,6 +23,7 @@ def register(app: typer.Typer) -> None:
 
 
 def campaign_command(
+    *,
     folder: Annotated[Path, typer.Argument(help="Folder of captures: any samples, angles and instruments.")],
     geometry: Annotated[
         Path | None, typer.Option(help="Geometry file (camera, source, shape), for psi, |D| and xi0.")
@@ -89,9 +90,8 @@ def campaign_command(
             found, simulated, omitted = curves.run(pool, tick)
         left_out = tuple(omitted)
         failed = tuple((path, one) for path, one in found if isinstance(one, Exception))
-        _show_means(
-            [one for _, one in found if not isinstance(one, Exception)], quantity, folder.name, target, simulated
-        )
+        points = [one for _, one in found if not isinstance(one, Exception)]
+        _show_means(points, quantity, folder.name, target, simulated=simulated)
     for text in left_out:
         typer.echo(f"left out: {text}", err=True)
     if failed:
@@ -122,7 +122,7 @@ def _show_comparison(result: CampaignResult, title: str, target: Path, with_pape
 
 
 def _show_means(
-    points: Sequence[CurvePoint], wanted: list[str] | None, title: str, target: Path, simulated: bool
+    points: Sequence[CurvePoint], wanted: list[str] | None, title: str, target: Path, *, simulated: bool
 ) -> None:
     from processing.errors import ProcessError
     from processing.reports.reflectance_figures import CURVES, curves_figure

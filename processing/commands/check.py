@@ -58,7 +58,7 @@ def check_command(
         typer.echo(f"{table}\n{table.with_suffix('.png')}")
 
     try:
-        run_batch("check", "rows", inputs, make, print_result, word="changed")
+        run_batch("check", "rows", inputs, make, print_result=print_result, word="changed")
     finally:
         if changes:
             table = reference.with_suffix(".checks.csv")

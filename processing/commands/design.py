@@ -22,6 +22,7 @@ def register(app: typer.Typer) -> None:
 
 
 def design_command(
+    *,
     instrument: Annotated[Path | None, typer.Argument(help="Instrument file of a Mueller polarimeter.")] = None,
     wavelength: Annotated[float | None, typer.Option(help="Wavelength in nm.")] = None,
     states: Annotated[str, typer.Option(help="Number of states; several for --optimize: 24,30,40.")] = "40",
@@ -66,9 +67,11 @@ def design_command(
     if stokes:
         if geometry is None or material is None or camera is None:
             raise ProcessError("--stokes needs --geometry FILE, --material FILE and --camera FILE")
-        from processing.commands.reflectance import design_command as design_stokes
+        from processing.calibration.illumination_design import Assumptions
+        from processing.commands.reflectance import design_stokes
 
-        design_stokes(geometry, material, camera, True, figure, electrons, xi0, albedo)
+        assumed = Assumptions(xi0=xi0, albedo=albedo, electrons=electrons)
+        design_stokes(geometry, material, camera, assumed, figure=figure)
         return
     if instrument is None:
         raise ProcessError("give an instrument file, for instance configs/instruments/rgb950.yaml (or --stokes)")
@@ -89,12 +92,12 @@ def design_command(
     if optimize is not None and "angles" in optimize:
         from processing.commands.loaded_late.design_angles import optimize_angles
 
-        now = {n: _present(model, n, ratio, step, table) for n in counts}
-        chosen = optimize_angles(model, noise, now, optimize, speed or (), weighted, jitter)
+        now = {n: _present(model, n, ratio, step, table=table) for n in counts}
+        chosen = optimize_angles(model, noise, now, optimize, speeds=speed or (), weighted=weighted, jitter_deg=jitter)
     elif optimize is not None:
-        chosen = _optimized(model, noise, counts, optimize, ratio)
+        chosen = _optimized(model, noise, counts, optimize, ratio=ratio)
     else:
-        chosen = _given(model, counts, ratio, step, table)
+        chosen = _given(model, counts, ratio, step, table=table)
         w = model.rows(chosen.angles_deg, changes_at(model, chosen.angles_deg))
         intensities = len(chosen) * len(model.channels)
         found = score(w, noise, determined_basis(model), bound_of(model, intensities))
@@ -122,13 +125,13 @@ def _counts(text: str) -> list[int]:
 
 
 def _present(
-    model: InstrumentModel, count: int, ratio: float, step: float | None, table: Path | None
+    model: InstrumentModel, count: int, ratio: float, step: float | None, *, table: Path | None
 ) -> StateTable | None:
     """What is measured now: the table that is given, or equal steps where there can be such."""
     from processing.errors import ProcessError
 
     try:
-        return _given(model, [count], ratio, step, table)
+        return _given(model, [count], ratio, step, table=table)
     except ProcessError:
         if table is not None:
             raise
@@ -136,7 +139,7 @@ def _present(
 
 
 def _given(
-    model: InstrumentModel, counts: list[int], ratio: float, step: float | None, table: Path | None
+    model: InstrumentModel, counts: list[int], ratio: float, step: float | None, *, table: Path | None
 ) -> StateTable:
     import numpy as np
 
@@ -162,7 +165,9 @@ def _given(
     return rotating_retarders(1.0, counts[0], step if step is not None else 360 / counts[0], ratio, axes=axes)
 
 
-def _optimized(model: InstrumentModel, noise: AssumedNoise, counts: list[int], free: str, ratio: float) -> StateTable:
+def _optimized(
+    model: InstrumentModel, noise: AssumedNoise, counts: list[int], free: str, *, ratio: float
+) -> StateTable:
     from processing.calibration.state_design import optimize, two_retarders
     from processing.commands.progress_bar import progress_bar
     from processing.errors import ProcessError

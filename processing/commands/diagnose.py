@@ -16,6 +16,7 @@ app = application("diagnose", "Compare captures with an instrument model and fin
 @app.command()
 @one_blas_thread()
 def diagnose_command(
+    *,
     captures: Annotated[list[Path], typer.Argument(help="Captures of one instrument, at one wavelength or several.")],
     instrument: Annotated[
         Path | None,
@@ -43,7 +44,8 @@ def diagnose_command(
     if reflectance is not None or geometry is not None:
         from processing.commands.loaded_late.diagnose_surface import diagnose_reflectance
 
-        diagnose_reflectance(captures, instrument, reflectance, geometry, write, json, report, verbose)
+        files = {"write": write, "json": json, "report": report}
+        diagnose_reflectance(captures, instrument, reflectance, geometry, **files, verbose=verbose)
         return
     from processing.commands.loaded_late.diagnose_summary import show, write_result
     from processing.commands.progress_bar import progress_line

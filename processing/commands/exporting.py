@@ -15,6 +15,7 @@ def register(app: typer.Typer) -> None:
 
 
 def export_command(
+    *,
     sources: Annotated[
         list[Path], typer.Argument(help="Captures, products, tables of `process table`, or folders of the last two.")
     ],

@@ -16,6 +16,7 @@ def register(app: typer.Typer) -> None:
 
 
 def camera_pose_command(
+    *,
     images: Annotated[list[Path], typer.Argument(help="Images of a ChArUco board, tilted this way and that.")],
     squares: Annotated[str, typer.Option(help="Squares across and down, e.g. 8x6.")],
     square_mm: Annotated[float, typer.Option(help="Side of a square in mm.")],

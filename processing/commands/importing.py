@@ -33,6 +33,7 @@ def register(app: typer.Typer) -> None:
 
 
 def import_command(
+    *,
     context: typer.Context,
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength of the measurement.")],
     items: Annotated[
@@ -157,7 +158,7 @@ def import_command(
         write_whole_text(kept, text)
         return Made((one.out,), False)
 
-    run_batch("importing", "states", list(requests), make, _print_imported)
+    run_batch("importing", "states", list(requests), make, print_result=_print_imported)
 
 
 def _print_imported(made: Made) -> None:

@@ -83,9 +83,9 @@ def ask(prompt: Callable[..., str]) -> str:
         f"name: {_quoted(name)}",
         f"wavelengths_nm: [{', '.join(f'{value:g}' for value in nm)}]",
         "# Elements between source and sample, in the order of the light.",
-        *_elements("generator", generator, "psg", generator_deg, psg),
+        *_elements("generator", generator, "psg", generator_deg, turning=psg),
         "# Elements between sample and detector, in the order of the light.",
-        *_elements("analyzer", analyzer, "psa", analyzer_deg, psa),
+        *_elements("analyzer", analyzer, "psa", analyzer_deg, turning=psa),
     ]
     text = "\n".join(lines) + "\n" + (_CAMERA if analyzer.endswith("camera") else "")
     nominal = [f"{side}_retarder.retardance_deg" for side, one in (("psg", psg), ("psa", psa)) if one.retardance_deg]
@@ -111,7 +111,7 @@ def _turning(prompt: Callable[..., str], number: int, axis: str, kind: str) -> _
     return _Turning(own, _numbers(prompt, f"{number + 1}. Retardance in degrees (nominal)", "90")[0])
 
 
-def _elements(side: str, kind: str, short: str, polarizer_deg: float, turning: _Turning) -> list[str]:
+def _elements(side: str, kind: str, short: str, polarizer_deg: float, *, turning: _Turning) -> list[str]:
     axis = f", axis: {_quoted(turning.axis)}" if turning.axis else ""
     retarder = f"  - {{kind: retarder, name: {short}_retarder{axis}, azimuth_deg: 0, retardance_deg: "
     retarder += f"{turning.retardance_deg or 0:g}}}"

@@ -21,6 +21,7 @@ def register(app: typer.Typer) -> None:
 
 
 def mean_command(
+    *,
     sources: Annotated[list[Path], typer.Argument(help="Captures or products of one sample, or folders of them.")],
     region: Annotated[
         str | None, typer.Option(help="Pixels to average: r0:r1,c0:c1; default: the middle half of the frame.")

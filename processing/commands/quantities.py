@@ -23,6 +23,7 @@ def register(app: typer.Typer) -> None:
 
 
 def quantities_command(
+    *,
     sources: Annotated[
         list[Path], typer.Argument(help="Captures or Mueller products of `process reduce`, or folders of them.")
     ],

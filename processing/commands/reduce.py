@@ -22,6 +22,7 @@ def register(app: typer.Typer) -> None:
 
 
 def reduce_command(
+    *,
     captures: Annotated[list[Path], typer.Argument(help="Captures (HDF5), or folders of them.")],
     instrument: Annotated[
         Path | None, typer.Option(help="Instrument file to use instead of the one in the capture.")

@@ -14,6 +14,7 @@ from processing.commands.purposes import REFLECTANCE
 from processing.whole_file import whole_file
 
 if TYPE_CHECKING:
+    from processing.calibration.illumination_design import Assumptions
     from processing.steps.file_step import FileStep, Found, Progress
 
 
@@ -23,29 +24,16 @@ def register(app: typer.Typer) -> None:
     app.command("extrapolate", rich_help_panel=REFLECTANCE)(extrapolate_command)
 
 
-def design_command(
-    geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
-    material: Annotated[Path, typer.Option(help="Material file: the dominant process.")],
-    camera: Annotated[Path, typer.Option(help="Instrument file of the Stokes camera.")],
-    stokes: Annotated[bool, typer.Option("--stokes", help="Design a linear Stokes capture.")] = False,
-    figure: Annotated[Path, typer.Option(help="Figure to draw (PNG).")] = Path("stokes_design.png"),
-    electrons: Annotated[float, typer.Option(help="Electrons in a channel for M00 = 1, unpolarized light.")] = 10_000.0,
-    xi0: Annotated[float, typer.Option(min=0.25, max=1, help="xi0 that is assumed.")] = 0.4,
-    albedo: Annotated[float, typer.Option(min=0, help="M00 at normal incidence that is assumed.")] = 0.5,
-) -> None:
+def design_stokes(geometry: Path, material: Path, camera: Path, given: Assumptions, *, figure: Path) -> None:
     """Recommend the illumination of a Stokes capture from the standard error of xi0 that it predicts."""
-    from processing.calibration.illumination_design import Assumptions, linear_states, predict
+    from processing.calibration.illumination_design import linear_states, predict
     from processing.commands.progress_bar import progress_bar
-    from processing.errors import ProcessError
     from processing.geometry.viewing import ViewingGeometry
     from processing.instrument.model import InstrumentModel
     from processing.reflectance.base import load_reflectance
     from processing.reports.reflectance_figures import stokes_design_figure
 
-    if not stokes:
-        raise ProcessError("only --stokes is designed here; `acquire --dry-run` scores a table of Mueller states.")
     view, model, instrument = ViewingGeometry.load(geometry), load_reflectance(material), InstrumentModel.load(camera)
-    given = Assumptions(xi0=xi0, albedo=albedo, electrons=electrons)
     ranked = {}
     for nm in model.wavelengths_nm:
         with progress_bar(f"{nm:g} nm", "angles") as tick:
@@ -64,6 +52,7 @@ def design_command(
 
 
 def fit_material_command(
+    *,
     sources: Annotated[list[Path], typer.Argument(help="Products of `process reduce`, one kind, one wavelength.")],
     geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
     out: Annotated[Path, typer.Option(help="Material file (YAML) to write.")],
@@ -101,6 +90,7 @@ def fit_material_command(
 
 
 def extrapolate_command(
+    *,
     sources: Annotated[
         list[Path], typer.Argument(help="Stokes captures or products of `process reduce`, or folders of them.")
     ],

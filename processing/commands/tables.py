@@ -18,6 +18,7 @@ def register(app: typer.Typer) -> None:
 
 
 def table_command(
+    *,
     sources: Annotated[list[Path], typer.Argument(help="Mueller or xi0 products of one wavelength.")],
     geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
     out: Annotated[Path, typer.Option(help="Table file (HDF5) to write.")],
@@ -61,6 +62,7 @@ def table_command(
 
 
 def compare_command(
+    *,
     reference: Annotated[Path, typer.Argument(help="Table of xi0 (`process table`, or of a campaign).")],
     other: Annotated[Path, typer.Argument(help="Table of xi0 to compare with it, of the same wavelength.")],
     geometry: Annotated[Path, typer.Option(help="Geometry file of the virtual object and its camera.")],
@@ -109,6 +111,7 @@ def compare_command(
 
 
 def export_command(
+    *,
     tables: Annotated[
         list[Path], typer.Argument(help="Mueller tables in the renderer layout, one a wavelength, or a material file.")
     ],

@@ -22,6 +22,7 @@ def register(app: typer.Typer) -> None:
 
 
 def xi0_command(
+    *,
     sources: Annotated[
         list[Path], typer.Argument(help="Captures or products of `process reduce`, or folders of them.")
     ],

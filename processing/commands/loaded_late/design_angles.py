@@ -25,6 +25,7 @@ def optimize_angles(
     noise: AssumedNoise,
     now: Mapping[int, StateTable | None],
     free: str,
+    *,
     speeds: Sequence[str],
     weighted: bool,
     jitter_deg: float,

@@ -15,6 +15,7 @@ def diagnose_reflectance(
     instrument: Path | None,
     reflectance: Path | None,
     geometry: Path | None,
+    *,
     write: Path | None,
     json: Path | None,
     report: Path | None,
