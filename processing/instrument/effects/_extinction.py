@@ -14,13 +14,11 @@ class Extinction(OpticsEffect):
     """The extinction (T_min over T_max) of each polarizer of a train is larger than in the model."""
 
     train: ClassVar[Literal["generator", "analyzer"]]
+    # A little below zero is allowed, so that noise about a perfect polarizer is not pushed to one side.
+    fixed_parameters = (Parameter("extinction", "1", -0.02, 0.5, 0.01),)
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(e.name for e in getattr(model, self.train) if isinstance(e, Polarizer))
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        # A little below zero is allowed, so that noise about a perfect polarizer is not pushed to one side.
-        return (Parameter("extinction", "1", -0.02, 0.5, 0.01),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.extinction[place] = changes.extinction[place] + values[0]

@@ -25,9 +25,7 @@ class Retardance(RetarderEffect):
     """The retardance differs from the model's."""
 
     belongs_to = "dispersion"
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("retardance", "degree", -40, 40, 1.0),)
+    fixed_parameters = (Parameter("retardance", "degree", -40, 40, 1.0),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.retardance_rad[place] = changes.retardance_rad[place] + np.deg2rad(values[0])
@@ -40,9 +38,7 @@ class Azimuth(RetarderEffect):
     """The fast axis differs from the model."""
 
     belongs_to = "mechanics"
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("azimuth", "degree", -45, 45, 1.0),)
+    fixed_parameters = (Parameter("azimuth", "degree", -45, 45, 1.0),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.azimuth_rad[place] = changes.azimuth_rad[place] + np.deg2rad(values[0])

@@ -2,7 +2,7 @@
 
 from processing.arrays import Array
 from processing.effect import Parameter
-from processing.instrument.changes import Changes, Conditions
+from processing.instrument.changes import Changes
 from processing.instrument.effects.base import OpticsEffect, turns
 from processing.instrument.model import InstrumentModel
 
@@ -12,9 +12,7 @@ class Transmission(OpticsEffect):
 
     belongs_to = "dispersion"
     is_level = True
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return tuple(Parameter(n, "1", -0.3, 0.3, 0.01) for n in ("cos_1", "sin_1", "cos_2", "sin_2"))
+    fixed_parameters = tuple(Parameter(n, "1", -0.3, 0.3, 0.01) for n in ("cos_1", "sin_1", "cos_2", "sin_2"))
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         factor = 1 + sum(v * wave for v, wave in zip(values, turns(model, changes.conditions, place), strict=True))

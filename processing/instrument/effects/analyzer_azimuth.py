@@ -26,12 +26,10 @@ class AnalyzerAzimuth(OpticsEffect):
     """All polarizers behind the sample are turned together, in degrees."""
 
     belongs_to = "mechanics"
+    fixed_parameters = (Parameter("azimuth", "degree", -45, 45, 1.0),)
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if polarizers(model) and model.mosaic is None else ()
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("azimuth", "degree", -45, 45, 1.0),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         for name in polarizers(model):

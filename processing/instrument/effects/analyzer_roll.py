@@ -5,13 +5,11 @@ Cause: the camera body or the analyzer unit is mounted at an angle.
 Mend: level it against the source's polarizer with the arm at 180 degrees.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from processing.arrays import Array
 from processing.effect import Parameter
-from processing.instrument.changes import Changes, Conditions
+from processing.instrument.changes import Changes
 from processing.instrument.effects.base import InstrumentEffect
 from processing.instrument.model import InstrumentModel
 
@@ -21,12 +19,7 @@ class AnalyzerRoll(InstrumentEffect):
 
     belongs_to = "mechanics"
     from_file_only = True
-
-    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        return ("",)
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("azimuth", "degree", -20, 20, 1.0),)
+    fixed_parameters = (Parameter("azimuth", "degree", -20, 20, 1.0),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         for element in (*model.analyzer, *(e for c in model.channels for e in c.elements)):

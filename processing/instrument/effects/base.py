@@ -19,16 +19,18 @@ class InstrumentEffect(Effect, ABC):
     """
 
     belongs_to: ClassVar[Belongs] = "wavelength"
+    #: Its parameters where they are the same in every instrument and at every place.
+    fixed_parameters: ClassVar[tuple[Parameter, ...]] = ()
     #: What of the product stands as it was at one moment of the capture, and which; None: nothing depends on time.
     reference: ClassVar[str | None] = None
 
-    @abstractmethod
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         """Where it can act in this instrument: element, axis or channel names; ("",) for the whole; () for nowhere."""
+        return ("",)
 
-    @abstractmethod
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         """The parameters at a place."""
+        return self.fixed_parameters
 
     @abstractmethod
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:

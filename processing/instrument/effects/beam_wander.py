@@ -19,13 +19,11 @@ class BeamWander(ImageShift):
     """Amplitudes in pixels of cos and sin of the turned angle, x to the right and y down."""
 
     belongs_to = "mechanics"
+    fixed_parameters = tuple(Parameter(n, "pixel", -5, 5, 0.2) for n in ("x_cos", "x_sin", "y_cos", "y_sin"))
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         axes = moving_axes(model, conditions)
         return tuple(e.name for e in model.elements() if e.axis in axes)
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return tuple(Parameter(n, "pixel", -5, 5, 0.2) for n in ("x_cos", "x_sin", "y_cos", "y_sin"))
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         element = next(e for e in model.elements() if e.name == place)

@@ -5,8 +5,6 @@ Mend: measure signal against exposure time at constant light, stay below about 7
 counts = light (1 - c light / full scale), which is inverted exactly.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from processing.arrays import Array
@@ -20,12 +18,7 @@ class DetectorNonlinearity(PointwiseEffect):
     """Fraction c of the signal that is lost at full scale."""
 
     is_response = True
-
-    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        return ("",)
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("lost_at_full_scale", "1", -0.2, 0.2, 0.01),)
+    fixed_parameters = (Parameter("lost_at_full_scale", "1", -0.2, 0.2, 0.01),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         c = values[0]

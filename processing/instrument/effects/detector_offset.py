@@ -5,8 +5,6 @@ Under an unknown sample it looks like depolarization, and like stray light of a 
 Mend: take dark states with the same exposure before and after; fix the black level in the camera.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from processing.arrays import Array
@@ -18,9 +16,6 @@ from processing.instrument.model import InstrumentModel
 
 class DetectorOffset(PointwiseEffect):
     """Counts that are left over in every pixel and state."""
-
-    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        return ("",)
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         top = conditions.full_scale

@@ -21,12 +21,10 @@ class FieldRetardance(InstrumentEffect):
     """Coefficients in degrees of x, y, x^2 - 1/3, x y, y^2 - 1/3."""
 
     varies_over_image = True
+    fixed_parameters = tuple(Parameter(n, "degree", -20, 20, 1.0) for n in FIELD_TERMS)
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(e.name for e in model.elements() if isinstance(e, Retarder))
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return tuple(Parameter(n, "degree", -20, 20, 1.0) for n in FIELD_TERMS)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         old = changes.field_retardance_rad.get(place, np.zeros(len(FIELD_TERMS)))

@@ -20,12 +20,10 @@ class GeneratorEllipticity(OpticsEffect):
     """Ellipticity angle in degrees behind the generator's polarizer."""
 
     belongs_to = "dispersion"
+    fixed_parameters = (Parameter("ellipticity", "degree", -20, 20, 1.0),)
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(e.name for e in model.generator if isinstance(e, Polarizer)) if len(model.generator) > 1 else ()
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("ellipticity", "degree", -20, 20, 1.0),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         polarizer = next(e for e in model.generator if e.name == place)

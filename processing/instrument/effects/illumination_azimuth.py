@@ -5,13 +5,11 @@ Cause: polarizer of the source not horizontal, arm or source rolled about the be
 Mend: level the source's polarizer against the camera's with the arm at 180 degrees.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from processing.arrays import Array
 from processing.effect import Parameter
-from processing.instrument.changes import Changes, Conditions
+from processing.instrument.changes import Changes
 from processing.instrument.effects.base import InstrumentEffect
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
@@ -22,12 +20,7 @@ class IlluminationAzimuth(InstrumentEffect):
 
     belongs_to = "mechanics"
     from_file_only = True
-
-    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        return ("",)
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("azimuth", "degree", -20, 20, 1.0),)
+    fixed_parameters = (Parameter("azimuth", "degree", -20, 20, 1.0),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.follow(model.generator[-1].name, mueller.rotation(np.deg2rad(values[0])))

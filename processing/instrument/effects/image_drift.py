@@ -18,12 +18,10 @@ class ImageDrift(ImageShift, OfOneCapture):
 
     belongs_to = "capture"
     reference = "the image stands where it was in the middle of the capture"
+    fixed_parameters = tuple(Parameter(n, "pixel", -5, 5, 0.2) for n in ("x", "y"))
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if conditions.states > 1 else ()
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return tuple(Parameter(n, "pixel", -5, 5, 0.2) for n in ("x", "y"))
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.shift_px = changes.shift_px + changes.conditions.elapsed[:, None] * values

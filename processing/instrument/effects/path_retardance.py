@@ -21,12 +21,10 @@ class PathRetardance(OpticsEffect):
     """Two components of a linear retardance in degrees: fast axis at 0, and at 45 degrees."""
 
     belongs_to = "dispersion"
+    fixed_parameters = tuple(Parameter(n, "degree", -40, 40, 1.0) for n in ("at_0", "at_45"))
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if len(model.generator) > 1 else ()
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return tuple(Parameter(n, "degree", -40, 40, 1.0) for n in ("at_0", "at_45"))
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         size, azimuth = np.hypot(*values), np.arctan2(values[1], values[0]) / 2

@@ -32,11 +32,10 @@ def neighbours(mosaic: tuple[tuple[str, ...], ...], channels: Sequence[str]) -> 
 class PixelCrosstalk(OpticsEffect):
     """Fraction of a pixel's light that its neighbours collect."""
 
+    fixed_parameters = (Parameter("fraction", "1", -0.05, 0.5, 0.02),)
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if model.mosaic is not None else ()
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("fraction", "1", -0.05, 0.5, 0.02),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         n = len(model.channels)

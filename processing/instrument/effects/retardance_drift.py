@@ -19,12 +19,10 @@ class RetardanceDrift(OpticsEffect, OfOneCapture):
     """Degrees from the first to the last state, and the bends of its course, which are zero at both."""
 
     reference = "the retardance of the file is that of the first state"
+    fixed_parameters = tuple(Parameter(n, "degree", -20, 20, 1.0) for n in ("change", "bend_2", "bend_3"))
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(e.name for e in model.elements() if isinstance(e, Retarder)) if conditions.states > 4 else ()
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return tuple(Parameter(n, "degree", -20, 20, 1.0) for n in ("change", "bend_2", "bend_3"))
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         t = changes.conditions.elapsed + 0.5

@@ -24,16 +24,14 @@ class RetardanceOverTurn(OpticsEffect):
     """
 
     belongs_to = "dispersion"
+    # Half a minute of wedge, met 1 mm beside the axis, is 1.3 nm in quartz: a degree in the visible.
+    fixed_parameters = tuple(Parameter(n, "degree", -10, 10, 0.5) for n in ("cos", "sin"))
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         axes = moving_axes(model, conditions)
         plates = (e for e in model.elements() if isinstance(e, Retarder) and e.axis in axes)
         # Over less than half a turn this wave is hardly anything else than another retardance with a slope.
         return tuple(e.name for e in plates if np.ptp(e.ratio * conditions.angles_deg[e.axis or ""]) > 180)
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        # Half a minute of wedge, met 1 mm beside the axis, is 1.3 nm in quartz: a degree in the visible.
-        return tuple(Parameter(n, "degree", -10, 10, 0.5) for n in ("cos", "sin"))
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         cos, sin, *_ = turns(model, changes.conditions, place)

@@ -17,12 +17,10 @@ class RetarderDiattenuation(OpticsEffect):
     """(T_fast - T_slow) / (T_fast + T_slow) of the retarder."""
 
     belongs_to = "dispersion"
+    fixed_parameters = (Parameter("diattenuation", "1", -0.3, 0.3, 0.01),)
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(e.name for e in model.elements() if isinstance(e, Retarder))
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("diattenuation", "1", -0.3, 0.3, 0.01),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.diattenuation[place] = changes.diattenuation[place] + values[0]

@@ -27,13 +27,11 @@ class RotationBacklash(InstrumentEffect):
     """Half of the play in degrees: angle = reading - backlash * direction."""
 
     belongs_to = "mechanics"
+    fixed_parameters = (Parameter("backlash", "degree", -5, 5, 0.2),)
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         axes = moving_axes(model, conditions)
         return tuple(a for a in axes if np.ptp(direction(conditions.angles_deg[a])) > 0)
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("backlash", "degree", -5, 5, 0.2),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         side = direction(changes.conditions.angles_deg[place])

@@ -19,12 +19,10 @@ class RotationEccentricity(InstrumentEffect):
     """Angle error in degrees: cos and sin of the axis angle, then of twice the angle."""
 
     belongs_to = "mechanics"
+    fixed_parameters = tuple(Parameter(n, "degree", -5, 5, 0.3) for n in ("cos_1", "sin_1", "cos_2", "sin_2"))
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return moving_axes(model, conditions)
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return tuple(Parameter(n, "degree", -5, 5, 0.3) for n in ("cos_1", "sin_1", "cos_2", "sin_2"))
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         t = np.deg2rad(changes.conditions.angles_deg[place])

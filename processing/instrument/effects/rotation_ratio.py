@@ -18,12 +18,10 @@ class RotationRatio(InstrumentEffect):
     """(true turn - turn read) / turn read; -2 is the opposite sense."""
 
     belongs_to = "mechanics"
+    fixed_parameters = (Parameter("relative", "1", -2.1, 0.1, 0.001),)
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return moving_axes(model, conditions)
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("relative", "1", -2.1, 0.1, 0.001),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.turn_axis(place, values[0] * changes.conditions.angles_deg[place], turned_by(model, place))

@@ -22,6 +22,8 @@ POSITIONS = 64
 class RotationSlip(OfOneCapture):
     """Angle error in degrees from the state on."""
 
+    fixed_parameters = (Parameter("slip", "degree", -45, 45, 1.0),)
+
     def slips(self, place: str) -> tuple[str, int]:
         axis, _, state = place.rpartition("@")
         return axis, int(state)
@@ -31,9 +33,6 @@ class RotationSlip(OfOneCapture):
         # A slip at the first state is an azimuth error.
         tried = np.unique(np.round(np.linspace(1, n - 1, min(POSITIONS, max(n - 1, 0)))).astype(int))
         return tuple(f"{axis}@{k}" for axis in moving_axes(model, conditions) for k in tried)
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("slip", "degree", -45, 45, 1.0),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         axis, first = self.slips(place)

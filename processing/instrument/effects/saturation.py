@@ -4,11 +4,9 @@ Cause: too long an exposure for the brightest state, a glint.
 Mend: shorten the exposure or bracket it. Clipped counts cannot be recovered: the correction excludes those pixels.
 """
 
-from collections.abc import Sequence
-
 from processing.arrays import Array
 from processing.effect import Parameter
-from processing.instrument.changes import Changes, Conditions
+from processing.instrument.changes import Changes
 from processing.instrument.effects.base import OfOneCapture
 from processing.instrument.model import InstrumentModel
 
@@ -17,12 +15,7 @@ class Saturation(OfOneCapture):
     """1: pixels with a clipped state are left out; the level is found from the counts, not fitted."""
 
     is_switch = True
-
-    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        return ("",)
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("left_out", "1", 0, 1, 1.0),)
+    fixed_parameters = (Parameter("left_out", "1", 0, 1, 1.0),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.drop_clipped = changes.drop_clipped or bool(values[0] > 0.5)

@@ -17,12 +17,10 @@ class SourceDrift(SourceEffect, OfOneCapture):
     """Relative change of the source from the first to the last state, and its departure from a straight line."""
 
     reference = "m00 is that for the source in the middle of the capture"
+    fixed_parameters = (Parameter("fraction", "1", -0.9, 0.9, 0.02), Parameter("curvature", "1", -0.9, 0.9, 0.02))
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if conditions.states > 1 else ()
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("fraction", "1", -0.9, 0.9, 0.02), Parameter("curvature", "1", -0.9, 0.9, 0.02))
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         t = changes.conditions.elapsed

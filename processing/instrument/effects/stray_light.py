@@ -17,11 +17,10 @@ from processing.instrument.model import InstrumentModel
 class StrayLight(OpticsEffect):
     """Stray light over the mean signal that the same throughput gives without polarization."""
 
+    fixed_parameters = (Parameter("fraction", "1", -0.05, 1.0, 0.01),)
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if model.axes else ()
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("fraction", "1", -0.05, 1.0, 0.01),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.stray += float(values[0])

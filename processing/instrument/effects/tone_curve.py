@@ -4,8 +4,6 @@ Cause: a camera or file format with gamma correction (8-bit pictures usually hav
 Mend: turn gamma off, store raw counts; otherwise invert the curve first.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from processing.arrays import Array
@@ -19,12 +17,7 @@ class ToneCurve(PointwiseEffect):
     """gamma - 1; light = full scale * (counts / full scale)^gamma."""
 
     is_response = True
-
-    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        return ("",)
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("gamma_minus_1", "1", -0.5, 1.5, 0.03),)
+    fixed_parameters = (Parameter("gamma_minus_1", "1", -0.5, 1.5, 0.03),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         e = values[0]

@@ -18,11 +18,10 @@ from processing.instrument.model import InstrumentModel
 class Hum(SourceEffect, OfOneCapture):
     """Amplitude of a modulation that repeats every eight states."""
 
+    fixed_parameters = (Parameter("amplitude", "1", -0.5, 0.5, 0.01),)
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if conditions.states > 8 else ()
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("amplitude", "1", -0.5, 0.5, 0.01),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         wave = np.sin(np.pi / 4 * np.arange(changes.conditions.states))
