@@ -87,8 +87,8 @@ class DiscProcess:
             with warnings.catch_warnings():
                 # Python 3.12 warns of any thread, those of the linear algebra too. The child takes no lock of theirs.
                 warnings.simplefilter("ignore", DeprecationWarning)
-                self._pid = os.fork()
-            if self._pid == 0:
+                self.pid = os.fork()
+            if self.pid == 0:
                 _serve(theirs, self._frame, dies_with)
         except OSError as error:
             raise AcquisitionError(
@@ -143,7 +143,7 @@ class DiscProcess:
         end_s = time.monotonic() + END_S
         while not self._thread.is_alive() and time.monotonic() < end_s:
             with contextlib.suppress(ChildProcessError):
-                if os.waitpid(self._pid, os.WNOHANG)[0] == 0:
+                if os.waitpid(self.pid, os.WNOHANG)[0] == 0:
                     time.sleep(0.005)
                     continue
             break

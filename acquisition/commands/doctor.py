@@ -60,9 +60,9 @@ def examine(config: RigConfig, folder: Path, frames: int = FRAMES) -> Iterator[F
     try:
         yield _guarded("emulators", rig.start) if config.simulator else Finding("rig", None, config.name)
         for name in config.axes:
-            yield _guarded(f"axis {name}", lambda name=name: _axis(rig.open_axis(name)))  # type: ignore[misc]
+            yield _guarded(f"axis {name}", lambda name=name: describe_axis(rig.open_axis(name)))  # type: ignore[misc]
         if config.source is not None:
-            yield _guarded("source", lambda: _source(rig))
+            yield _guarded("source", lambda: describe_source(rig))
         yield _guarded("camera", lambda: _camera(rig.open_camera(), config, frames))
     finally:
         failure = run_all([("close the rig", rig.close)])
@@ -107,7 +107,8 @@ def _instrument(path: Path) -> str:
     return f"{model.name} ({path.name})"
 
 
-def _axis(axis: MotionAxis) -> str:
+def describe_axis(axis: MotionAxis) -> str:
+    """An axis in a line: who it is, where it stands, its limits, speed and warnings. Raises DeviceError."""
     who = axis.describe()
     limits = axis.limits
     ends = "limits " + " to ".join("none" if end is None else f"{end:g}" for end in (limits.min_deg, limits.max_deg))
@@ -127,7 +128,8 @@ def _axis(axis: MotionAxis) -> str:
     return f"{name}, {who.port}: {homed}{moving}, {position}{ends}, speed {speed}{stop}{warnings}"
 
 
-def _source(rig: Rig) -> str:
+def describe_source(rig: Rig) -> str:
+    """The light source in a line; light that nobody switched on is an error."""
     source = rig.open_source()
     state = "light on" if source.is_on() else "light off"
     who = source.describe()

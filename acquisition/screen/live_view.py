@@ -59,7 +59,7 @@ class LiveView(Observer):
     def __enter__(self) -> Self:
         self._link, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         passed = [self._listener.fileno(), other.fileno(), self._memory]
-        self._process = subprocess.Popen(
+        self.process = subprocess.Popen(
             [sys.executable, "-m", "acquisition.screen.live_process", *map(str, passed)],
             pass_fds=passed,
             cwd=Path(__file__).parents[2],
@@ -79,10 +79,10 @@ class LiveView(Observer):
             # The page shows the end for as long as it takes to read this, then its process ends.
             self._link.shutdown(socket.SHUT_WR)
         try:
-            self._process.wait(ENDING_S)
+            self.process.wait(ENDING_S)
         except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+            self.process.kill()
+            self.process.wait()
         self._hearing.join(ENDING_S)
         self._link.close()
         os.close(self._memory)

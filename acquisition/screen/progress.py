@@ -65,7 +65,7 @@ class ConsoleProgress(Observer):
             self._campaign_s, self._first = now_s, self._current
             return f"{place}, "
         each_s = (now_s - self._campaign_s) / max(self._current - self._first, 1)
-        return f"{place}, about {_duration(each_s * (self._captures - self._current))} left, "
+        return f"{place}, about {duration_text(each_s * (self._captures - self._current))} left, "
 
     def activity(self, text: str) -> None:
         if self._bar is not None:
@@ -102,7 +102,7 @@ class ConsoleProgress(Observer):
         say(self._console if self._bar is None else self._bar.console, text)
 
 
-def _duration(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Seconds, minutes, or hours and minutes, as a person says it."""
     if seconds < 100:
         return f"{seconds:.0f} s"

@@ -61,15 +61,16 @@ def scalar_quantities() -> dict[str, Scalar]:
         A file has no `value` or no docstring, or a plug-in offers a name that exists already.
     """
     names = (module.name for module in pkgutil.iter_modules(scalars.__path__))
-    found = {name: _scalar(name, importlib.import_module(f"{scalars.__name__}.{name}")) for name in names}
+    found = {name: read_scalar(name, importlib.import_module(f"{scalars.__name__}.{name}")) for name in names}
     for entry in entry_points(group=GROUP):
         if entry.name in found:
             raise ProcessError(f"plug-in {entry.value} offers the quantity {entry.name!r}, which exists already")
-        found[entry.name] = _scalar(entry.name, entry.load())
+        found[entry.name] = read_scalar(entry.name, entry.load())
     return dict(sorted(found.items()))
 
 
-def _scalar(name: str, module: ModuleType) -> Scalar:
+def read_scalar(name: str, module: ModuleType) -> Scalar:
+    """The quantity that a module defines. Raises ProcessError."""
     if not module.__doc__ or not hasattr(module, "value"):
         raise ProcessError(f"{module.__name__} is no quantity: it needs a docstring and a function value(m)")
     return Scalar(

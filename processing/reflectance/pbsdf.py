@@ -90,10 +90,10 @@ def export(
     missing, written = 0.0, 0
     for k, table in enumerate(ordered):
         blocks = {}
-        blocks["M"], gaps = _dense(table, table.mean, white_m00, empty)
+        blocks["M"], gaps = fill_bins(table, table.mean, white_m00, empty)
         if uncertainty:
             total = np.sqrt(sum(np.square(part) for part in table.uncertainties.values()))
-            blocks["u"], _ = _dense(table, total, white_m00, "nan")
+            blocks["u"], _ = fill_bins(table, total, white_m00, "nan")
         missing = max(missing, gaps)
         for slot, source in enumerate(slots):
             if source == k:
@@ -132,7 +132,7 @@ def load(path: Path | str, white_m00: float = 1.0, only_nm: float | None = None)
         raise TableError(f"{path}: its wavelengths are not all different")
     if not np.all((wavelengths > 0) & (wavelengths < 1e6)):
         raise TableError(f"{path}: its wavelengths are no wavelengths in nm")
-    angles, cos_i, _ = _grid()
+    angles, cos_i, _ = bin_centres()
     tables = {}
     for k, wavelength in enumerate(wavelengths):
         if only_nm is not None and abs(only_nm - wavelength) > 0.5:
@@ -188,8 +188,8 @@ def _check(table: ScatteringTable, white_m00: float, uncertainty: bool) -> None:
         raise TableError(f"the table at {table.wavelength_nm:g} nm does not know its noise. Leave --uncertainty away.")
 
 
-def _grid() -> tuple[Angles, Array, Array]:
-    # Bin centres (theta_h, theta_d, phi_d) and the cosines at them.
+def bin_centres() -> tuple[Angles, Array, Array]:
+    """Bin centres (theta_h, theta_d, phi_d) and the cosines at them."""
     axes = TableAxes("renderer")
     grid = np.meshgrid(
         *(np.deg2rad(a) for a in (axes.theta_h_deg, axes.theta_d_deg, axes.phi_d_deg)), indexing="ij", sparse=True
@@ -200,9 +200,9 @@ def _grid() -> tuple[Angles, Array, Array]:
     return Angles(th, td, ph), along - across, along + across
 
 
-def _dense(table: ScatteringTable, values: Array, white_m00: float, empty: str) -> tuple[NDArray[np.float32], float]:
-    # Values (16, bins) of a table in the layout of the file, and the fraction of visible bins without samples.
-    _, cos_i, cos_o = _grid()
+def fill_bins(table: ScatteringTable, values: Array, white_m00: float, empty: str) -> tuple[NDArray[np.float32], float]:
+    """Values (16, bins) of a table in the layout of the file, and the fraction of visible bins without samples."""
+    _, cos_i, cos_o = bin_centres()
     visible = (cos_i > 0) & (cos_o > 0)
     row = np.full(SHAPE, -1, dtype=np.int32)
     row.reshape(-1)[table.bins] = np.arange(table.bins.size, dtype=np.int32)

@@ -12,12 +12,13 @@ import pytest
 
 from acquisition.capture import state_file
 from acquisition.capture.state_file import LINE_BYTES, StateFile
+from acquisition.capture.text_box import TextBox
 from acquisition.capture.writer import CaptureWriter
 from acquisition.errors import AcquisitionError
 from processing.instrument.states import StateTable
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import CLOSING_BYTES, SEGMENTS_BYTES, CaptureHeader
-from processing.storage.captures.segments import encode_line
+from processing.storage.captures.segments import decode_lines, encode_line
 
 SHAPE, STATES = (4, 5), 3
 HEADER = CaptureHeader(title="three states", simulated=True, mode="drr", wavelength_nm=662)
@@ -42,6 +43,31 @@ def file(path: Path):
     opened = StateFile(path)
     yield opened
     opened.close()
+
+
+class Bytes:
+    """The bytes of the file at its places, seen and changed past the program that writes it."""
+
+    def __init__(self, path: Path) -> None:
+        self.descriptor = os.open(path, os.O_RDWR)
+        with h5py.File(path, locking=False) as h5:
+            self.segments, self.closing = (
+                TextBox(self.descriptor, h5[f"entry/{name}/json"]) for name in ("segments", "closing")
+            )
+
+    def read(self, length: int, offset: int) -> bytes:
+        return os.pread(self.descriptor, length, offset)
+
+    @property
+    def journal_end(self) -> int:
+        return decode_lines(self.segments.read(self.descriptor))[1]
+
+
+@pytest.fixture
+def raw(path: Path, file: StateFile):
+    opened = Bytes(path)
+    yield opened
+    os.close(opened.descriptor)
 
 
 def test_the_disc_begins_with_an_image_while_it_is_written(path, file, monkeypatch):
@@ -109,38 +135,38 @@ def test_columns_are_read_and_replaced_whole(path, file):
     assert file.read_column("repeats").tolist() == [2] * STATES
 
 
-def test_journal_keeps_its_lines_and_takes_over_what_was_cut_off(path, file):
-    beyond = os.pread(file._file, 256, file._segments.offset + file._segments.room)
+def test_journal_keeps_its_lines_and_takes_over_what_was_cut_off(file, raw):
+    box = raw.segments
+    beyond = raw.read(256, box.offset + box.room)
     assert file.segment_records() == []
     file.add_segment_record({"event": "begin", "n": 1})
     file.add_segment_record({"event": "end"}, part=0.5)
     assert file.segment_records() == [{"event": "begin", "n": 1}, {"event": "end"}]
     # A line whose end never reached the disc is not there, and the next one covers all of it.
-    end = file._journal()[1]
-    file._set_length(file._segments, end + 400)
-    file._write(file._segments.offset + end, np.frombuffer(b"12345678 {" + 300 * b"x", np.uint8))
+    end = raw.journal_end
+    box.set_length(raw.descriptor, end + 400)
+    os.pwrite(raw.descriptor, b"12345678 {" + 300 * b"x", box.offset + end)
     file.add_segment_record({"event": "begin", "n": 2})
     assert [r.get("n") for r in file.segment_records()] == [1, None, 2]
-    rest = os.pread(file._file, file._segments.room, file._segments.offset)[file._journal()[1] :]
-    assert not rest.strip(b"\0")
+    assert not raw.read(box.room, box.offset)[raw.journal_end :].strip(b"\0")
     # What comes after the journal in the file is not touched.
-    assert os.pread(file._file, 256, file._segments.offset + file._segments.room) == beyond
+    assert raw.read(256, box.offset + box.room) == beyond
 
 
-def test_a_record_is_cut_to_its_part_of_the_room_and_a_full_journal_is_told(path, file):
-    room = file._segments.room
+def test_a_record_is_cut_to_its_part_of_the_room_and_a_full_journal_is_told(file, raw):
+    room = raw.segments.room
     file.add_segment_record({"event": "end", "messages": ["m" * 100] * (room // 50)}, part=0.5)
     (record,) = file.segment_records()
     assert record["left_out"]["messages"] > 0
-    used = file._journal()[1]
+    used = raw.journal_end
     assert 0.4 * room < used <= 0.5 * room
     # A line as long as the room takes all of it, one byte more does not fit, and nothing is written then.
     left = room - used - LINE_BYTES - len('{"t": ""}')
     with pytest.raises(AcquisitionError, match="its journal is full"):
         file.add_segment_record({"t": "x" * (left + 1)})
-    assert file._journal()[1] == used
+    assert raw.journal_end == used
     file.add_segment_record({"t": "x" * left})
-    assert file._journal()[1] == room
+    assert raw.journal_end == room
     with pytest.raises(AcquisitionError, match="its journal is full"):
         file.add_segment_record({}, part=0.5)
 
@@ -200,11 +226,11 @@ def test_a_text_that_is_cut_off_anywhere_reads_as_before_or_as_it_is_now(path, f
     assert seen[-1] == now
 
 
-def test_padded_texts_of_an_older_file_are_gone_on_with(path, file):
+def test_padded_texts_of_an_older_file_are_gone_on_with(path, file, raw):
     """Where the length was that of the room; the next text ends where it ends."""
     file.add_segment_record({"event": "begin"})
-    for box in (file._segments, file._closing):
-        file._set_length(box, box.room)
+    for box in (raw.segments, raw.closing):
+        box.set_length(raw.descriptor, box.room)
     file.close()
     with Capture(path) as there:
         assert there.closing == {}

@@ -256,7 +256,7 @@ def test_an_error_of_the_disc_is_told_at_once_and_by_the_next_call(create, monke
 def test_a_state_for_a_disc_process_that_has_ended_is_refused_at_once(create, caplog):
     """What would be told of it by another thread would be raised where nobody hears it."""
     writer = create()
-    os.kill(disc()._pid, signal.SIGKILL)
+    os.kill(disc().pid, signal.SIGKILL)
     with pytest.raises(AcquisitionError, match="has ended"):
         writer.forget()
     with StopRequest() as stop, stop.failing_here():

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from acquisition.commands.doctor import _axis
+from acquisition.commands.doctor import describe_axis
 from drivers.errors import CommandRejected, DeviceError, LimitError, MotionFailed, ReplyTimeout
 from processing.labelled import open_dataset, write_dataset
 from simulators.clock import FastClock
@@ -64,7 +64,7 @@ class TestLCC25(EmulatorNoise):
             assert axis.config.named_states() == VOLTS
             assert axis.home().wait().deg == 2.2
             assert axis.warnings() == []
-            assert _axis(axis).endswith(": at 2.2000 V, limits 0 to 25")
+            assert describe_axis(axis).endswith(": at 2.2000 V, limits 0 to 25")
 
     def test_limits_are_volts_and_refused_without_a_byte(self) -> None:
         with self.served("lcc25") as served:

@@ -223,8 +223,8 @@ def test_the_run_goes_on_when_the_process_of_the_page_is_killed():
     with told.view as view:
         view.run_started("killed", None, 5, None)
         told.wait_for(lambda state: state.get("title") == "killed")
-        view._process.kill()
-        view._process.wait()
+        view.process.kill()
+        view.process.wait()
         for number in range(20):
             told.state(number)
     assert not told.stop.requested
@@ -290,7 +290,7 @@ def test_stop_answers_under_a_thousand_slow_connections(body):
         while not told.stop.requested and time.monotonic() - begin_s < 20:
             time.sleep(0.005)
         stopped_s = time.monotonic() - begin_s
-        memory = int(re.search(r"VmHWM:\s+(\d+)", Path(f"/proc/{view._process.pid}/status").read_text())[1])
+        memory = int(re.search(r"VmHWM:\s+(\d+)", Path(f"/proc/{view.process.pid}/status").read_text())[1])
         end()
     print(f"stopped after {stopped_s:.3f} s; memory of the page {memory / 1024:.0f} MiB")
     assert told.stop.requested

@@ -15,7 +15,7 @@ from acquisition.campaign.summary import summary_lines
 from acquisition.errors import AcquisitionError
 from acquisition.screen.notify import NotifyConfig, notifying
 from acquisition.screen.observer import StateReport
-from acquisition.screen.progress import ConsoleProgress, _duration
+from acquisition.screen.progress import ConsoleProgress, duration_text
 from acquisition.screen.rows import print_rows
 from drivers.motion import Position
 from processing.campaign.captures import find_captures
@@ -151,7 +151,7 @@ def test_bar_count_and_time_left_survive_at_80_columns(captures):
 
 def test_the_console_says_how_far_the_campaign_is():
     assert "capture 3 of 72, a title: 40 states" in _shown(80, 72)
-    assert [_duration(s) for s in (42, 360, 7380)] == ["42 s", "6 min", "2 h 03 min"]
+    assert [duration_text(s) for s in (42, 360, 7380)] == ["42 s", "6 min", "2 h 03 min"]
 
 
 def test_piped_rows_are_not_padded_and_no_color_is_honoured(monkeypatch):

@@ -52,7 +52,7 @@ ENDS: dict[str, Callable[[], None]] = {
     "stopped at once": lambda: _send(signal.SIGINT, signal.SIGINT),
     "a device fails": lambda: _fail(DeviceError("a device", "broke", "Mend it")),
     "unforeseen": lambda: _fail(MemoryError("injected")),
-    "disc process killed": lambda: os.kill(disc()._pid, signal.SIGKILL),
+    "disc process killed": lambda: os.kill(disc().pid, signal.SIGKILL),
     "killed": lambda: _send(signal.SIGKILL),
 }
 MOMENTS = ("exposing", "state_done")

@@ -92,7 +92,7 @@ def test_a_campaign_whose_disc_process_was_killed_takes_its_folder_again(
     def killed_once(*arguments, **options):
         tries.append(1)
         if len(tries) == 1:
-            os.kill(disc()._pid, signal.SIGKILL)
+            os.kill(disc().pid, signal.SIGKILL)
             if somebody_was_faster:
                 others.acquire(timeout=60)
         taken = take(*arguments, **options)

@@ -234,16 +234,16 @@ def test_a_full_disc_at_the_quick_look_fails_no_complete_capture(acquire, quick_
 
 
 def test_doctor_says_that_a_light_was_left_on(small_rig):
-    from acquisition.commands.doctor import _source
+    from acquisition.commands.doctor import describe_source
     from acquisition.rig.config import load_rig
     from acquisition.rig.open_rig import open_rig
 
     with open_rig(load_rig(small_rig()), with_camera=False) as rig:
-        assert "light off" in _source(rig)
+        assert "light off" in describe_source(rig)
         rig.source.set_light(True)
         rig.source.close()
         with pytest.raises(AcquisitionError, match="LIGHT LEFT ON"):
-            _source(rig)
+            describe_source(rig)
 
 
 def test_captures_leave_no_thread_and_no_descriptor(run_with):

@@ -174,4 +174,4 @@ def test_the_components_of_purity_make_up_the_depolarization_index() -> None:
 def test_a_file_that_is_no_quantity_is_refused() -> None:
     module = ModuleType("nothing", "A title.")
     with pytest.raises(ProcessError, match=r"nothing is no quantity: .*value"):
-        scalar_files._scalar("nothing", module)
+        scalar_files.read_scalar("nothing", module)

@@ -28,7 +28,7 @@ def test_in_renderer_frames_first_surface_reflection_is_a_plain_fresnel_matrix()
 
 
 def test_cosines_of_bins_equal_those_of_vectors():
-    angles, cos_i, cos_o = pbsdf._grid()
+    angles, cos_i, cos_o = pbsdf.bin_centres()
     some = tuple(np.random.default_rng(1).integers(0, n, size=50) for n in (91, 91, 361))
     n, wi, wo = directions(*(a[some] for a in angles))
     np.testing.assert_allclose(cos_i[some], np.sum(n * wi, axis=1), atol=1e-12)
@@ -97,8 +97,8 @@ def test_export_and_import_give_the_filled_bins_back(tmp_path):
 def test_empty_bins_take_the_nearest_value_around_the_circle():
     one = np.deg2rad([[10.0, 20.0, 179.0], [10.0, 20.0, 0.0]]).T
     table = mueller_table(Angles(*one), np.stack([np.full(16, 1.0), np.full(16, 2.0)], axis=-1))
-    dense, gaps = pbsdf._dense(table, table.mean, 1.0, "nearest")
-    _, cos_i, _ = pbsdf._grid()
+    dense, gaps = pbsdf.fill_bins(table, table.mean, 1.0, "nearest")
+    _, cos_i, _ = pbsdf.bin_centres()
     i, j = round(90 * np.sqrt(10 / 90)), 20
     got = dense[:, j, i, 0, 0] * np.pi * cos_i[i, j]
     assert 0.999 < gaps < 1
