@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE
-from processing.diagnosis.instrument.guard import chances, lasts
+from processing.diagnosis.instrument.mueller_error import chances, lasts
 from processing.diagnosis.search.decision import PredictedChange, predicted_change
 from processing.diagnosis.search.names import PART_OF_LEFT
 

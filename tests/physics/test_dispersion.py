@@ -11,7 +11,6 @@ from processing.diagnosis.instrument.initial_values import first_values
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.dispersion import curve
 from processing.diagnosis.search.space import Space
-from processing.diagnosis.search.stored import by_wavelength
 from processing.effect import Parameter
 from processing.errors import ProcessError
 from processing.instrument.changes import Changes, Conditions
@@ -91,7 +90,7 @@ def test_a_train_far_off_is_followed_through_a_half_wave(problem) -> None:
     sums = problem.sums(base, values, derivatives=False)
     assert sums.excess.sum() < 5 * np.sqrt(2 * sums.freedom.sum())
     plate = next(c for c in base.candidates if c.place == "psg_retarder.retardance_deg")
-    told = [180 + v[0] for _, v, _ in by_wavelength(plate, found[plate], np.eye(plate.size))]
+    told = [180 + v[0] for _, v, _ in plate.by_wavelength(found[plate], np.eye(plate.size))]
     truth = np.array([retardance_deg(w) for w in WAVELENGTHS])
     # The same plate in the other sense, at all wavelengths: it never turns back.
     assert min(np.abs(told - truth).max(), np.abs(360 - np.array(told) - truth).max()) < 0.2

@@ -11,7 +11,6 @@ from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import CaptureReport, NoiseReport, NotMeasured
 from processing.diagnosis.search.space import Space
-from processing.diagnosis.search.stored import by_wavelength
 from processing.diagnosis.tell.answer import error
 from processing.instrument.changes import places
 from processing.instrument.model import EffectParameter
@@ -44,7 +43,7 @@ def calibrated(problem: InstrumentProblem, found: Posterior, solved: Solution) -
     nominal = {c: p for c, p in solved.base.pairs if c.place}
     for candidate, where in nominal.items():
         covariance = found.covariance[part[candidate], part[candidate]]
-        for one, (fitted,), ((variance,),) in by_wavelength(candidate, solved.fit.values[where], covariance):
+        for one, (fitted,), ((variance,),) in candidate.by_wavelength(solved.fit.values[where], covariance):
             for model, wavelength in zip(problem.models, problem.wavelengths_nm, strict=True):
                 if one.wavelength_nm in (None, wavelength):
                     start = float(model.value_of(candidate.place))  # type: ignore[arg-type]

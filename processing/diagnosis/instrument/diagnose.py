@@ -14,8 +14,7 @@ from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.captured.screening import screened
 from processing.diagnosis.instrument.answer import calibrated, capture_report, missing, noise_report, not_measured
 from processing.diagnosis.instrument.doubts import doubts, testable
-from processing.diagnosis.instrument.guard import chances, lasts
-from processing.diagnosis.instrument.mueller_error import MuellerErrors
+from processing.diagnosis.instrument.mueller_error import MuellerErrors, chances, lasts
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
 from processing.diagnosis.instrument.structure import Residual, descriptions, residual

@@ -6,7 +6,7 @@ not applied and remain in this error. So does what was found and is not used.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
+from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.decision import PredictedChange, predicted_change
+from processing.diagnosis.search.decision import PredictedChange, chance_checks, predicted_change
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.range_of import RANK
-from processing.diagnosis.search.result import MuellerError
-from processing.diagnosis.search.rules import TAKES_PART
+from processing.diagnosis.search.result import Check, MuellerError
+from processing.diagnosis.search.rules import CHANCE_WORSE, TAKES_PART
 from processing.diagnosis.search.space import Space
-from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
 from processing.instrument.changes import Changes
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
 
@@ -152,7 +152,7 @@ class MuellerErrors:
         return predicted_change(given[own], self.values[own], self.covariance[np.ix_(own, own)], products)
 
     def _of(self, scope: str) -> NDArray[np.bool_]:
-        return np.array([scope_of(c) == scope for c in self.space.candidates for _ in c.parameters], dtype=bool)
+        return np.array([c.scope == scope for c in self.space.candidates for _ in c.parameters], dtype=bool)
 
     def uncertain(self, problem: InstrumentProblem, used: Solution) -> tuple[SystematicError, MuellerError] | None:
         """What stays uncertain of M/m00 about the values that are applied, as a file stores it and as it is told.
@@ -228,14 +228,14 @@ def _as_effects(space: Space, direction: Array, size: Array, names: tuple[str, .
         if size[part].max() <= SMALL_PART * size.max():
             continue
         own = direction[part]
-        for one, values, _ in by_wavelength(candidate, own, np.zeros((own.size, own.size))):
+        for one, values, _ in candidate.by_wavelength(own, np.zeros((own.size, own.size))):
             effects.append(
                 AppliedEffect(
                     kind=one.kind,
                     element=one.place or None,
-                    parameters=_values_alone(parameters_of(one, values, values)),
-                    captures=() if scope_of(one) == "instrument" else _captures(one, names),
-                    scope=scope_of(one),
+                    parameters=_values_alone(one.stored(values, values)),
+                    captures=() if one.scope == "instrument" else _captures(one, names),
+                    scope=one.scope,
                     wavelength_nm=one.wavelength_nm,
                 )
             )
@@ -258,3 +258,41 @@ def _values_alone(parameters: dict[str, EffectParameter]) -> dict[str, EffectPar
         )
         for name, p in parameters.items()
     }
+
+
+def chances(
+    here: PredictedChange, later: PredictedChange, lasting: bool, each: Mapping[str, PredictedChange]
+) -> tuple[Check, ...]:
+    """Error of M as the posterior expects it, and the chance that it grows: an explanation may be too vague to use.
+
+    Of all captures together it decides. Of `each` of several it is told: a sample that hardly polarizes gains little
+    and may lose. What is too vague for later captures is written for these alone (`lasts`).
+    """
+    predicted, grows = chance_checks("M/m00", here)
+    alone = "" if lasting else ", so it is written for these captures alone"
+    return (
+        predicted,
+        grows,
+        Check(name=f"{grows.name} in later captures{alone}", before=0.0, after=later.rounded_chance, holds=True),
+        *(
+            Check(
+                name=f"predicted error of M/m00 of {name}, rms (it grows with a chance of {_in_words(change)})",
+                before=change.before,
+                after=change.after,
+                holds=True,
+            )
+            for name, change in each.items()
+        ),
+    )
+
+
+def _in_words(change: PredictedChange) -> str:
+    return f"{change.rounded_chance:.2g}" if change.rounded_chance > 0 else "less than 0.0001"
+
+
+def lasts(later: PredictedChange, reasons: Collection[str] = ()) -> bool:
+    """Whether what belongs to the instrument may be used for later captures; `reasons` for which names are doubted.
+
+    Where the sample changed, what is found of the instrument may be a part of that.
+    """
+    return later.chance_worse <= CHANCE_WORSE and OF_THE_SAMPLE not in reasons

@@ -11,7 +11,7 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit
-from processing.diagnosis.search.range_of import part_outside
+from processing.diagnosis.search.range_of import least_apart
 from processing.diagnosis.search.rules import APART
 from processing.diagnosis.search.space import Space
 from processing.polarization import mueller
@@ -84,15 +84,11 @@ def _power(
     rivals: Sequence[Candidate],
     unseen: Sequence[Candidate],
 ) -> float:
-    signatures = [_signature(problem, space, fit, sample.reshape(16), candidate=c) for c in rivals]
-    value = 1.0
-    for i, first in enumerate(signatures):
-        for second in signatures[i + 1 :]:
-            value = min(value, _sine(first, second))
-    if rivals:
-        return value if len(rivals) > 1 else 1.0
-    seen = [np.linalg.norm(_signature(problem, space, fit, sample.reshape(16), candidate=c)) > VISIBLE for c in unseen]
-    return float(np.mean(seen)) if seen else 0.0
+    signatures = [_signature(problem, space, fit, sample.reshape(16), candidate=c) for c in rivals or unseen]
+    seen = [bool(np.linalg.norm(each) >= VISIBLE) for each in signatures]
+    if not rivals:
+        return float(np.mean(seen)) if seen else 0.0
+    return least_apart(signatures) if all(seen) or len(rivals) == 1 else 0.0
 
 
 def _signature(problem: InstrumentProblem, space: Space, fit: Fit, sample: Array, *, candidate: Candidate) -> Array:
@@ -116,10 +112,3 @@ def _signature(problem: InstrumentProblem, space: Space, fit: Fit, sample: Array
         d = (signal(moved) - start) / STEP
         columns.append(d - start * (start @ d) / scale**2)
     return np.stack(columns, axis=1) / scale
-
-
-def _sine(first: Array, second: Array) -> float:
-    """Part of the smaller signature that the other cannot mimic; 0 if either is not seen."""
-    if min(np.linalg.norm(first), np.linalg.norm(second)) < VISIBLE:
-        return 0.0
-    return min(part_outside(first, second), part_outside(second, first))

@@ -15,7 +15,7 @@ from processing.diagnosis.instrument.pixel_sums import Pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
 from processing.diagnosis.instrument.tiles import tile_columns
-from processing.diagnosis.search.decision import beyond_chance, in_deviations
+from processing.diagnosis.search.decision import in_deviations, in_words
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.linearized import deviation_of
 from processing.diagnosis.search.range_of import range_of
@@ -55,12 +55,6 @@ class Residual:
     leading: Array
     leading_share: float
     left: float = 0.0
-
-    @property
-    def worst(self) -> tuple[str, float]:
-        """The test that is furthest off."""
-        name = max(self.tests, key=lambda k: self.tests[k])
-        return name, self.tests[name]
 
 
 @dataclass(frozen=True)
@@ -292,8 +286,7 @@ def descriptions(names: Sequence[str], left: Sequence[Residual]) -> tuple[str, .
 
 def description(found: Residual) -> list[str]:
     """Sentences about what is left over; empty if nothing is."""
-    beyond = beyond_chance(found.tests)
-    lines = [f"{name}: {value:.0f} standard deviations above noise" for name, value in beyond.items()]
+    lines = in_words(found.tests)
     if not lines:
         return []
     order = np.argsort(-np.abs(found.mean))[:3]

@@ -8,7 +8,7 @@ counts by how long the chain stays there. That includes the many sets that are u
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,6 +49,17 @@ class Samples:
         return float(self.weight @ self.sets[:, list(members)].any(axis=1))
 
 
+def _moments(sets: Sets, visited: Iterable[tuple[float, Conditional, Array]]) -> tuple[Array, Array, Array]:
+    """Probability (G,) of each group; mean (K,) and covariance (K, K) of the parameters, of weighted sets."""
+    probability, mean, second = np.zeros(len(sets.groups)), np.zeros(sets.size), np.zeros((sets.size, sets.size))
+    for weight, c, chance in visited:
+        probability += weight * chance
+        if weight > LEAST_WEIGHT:
+            mean[c.active] += weight * c.mean
+            second[np.ix_(c.active, c.active)] += weight * (c.covariance + np.outer(c.mean, c.mean))
+    return probability, mean, second - np.outer(mean, mean)
+
+
 class _ByEvidence:
     """Every set that was visited counts once, by how likely it is."""
 
@@ -70,17 +81,9 @@ class _ByEvidence:
         seen = sorted(self._seen.values(), key=lambda v: -v[0])
         weight = np.exp(np.array([v[0] for v in seen]) - seen[0][0])
         weight /= weight.sum()
-        probability = np.zeros(len(self._sets.groups))
-        size = self._sets.size
-        mean, second = np.zeros(size), np.zeros((size, size))
-        for w, (_, c, _, chance) in zip(weight, seen, strict=True):
-            if w < LEAST_WEIGHT:
-                break
-            probability += w * chance
-            mean[c.active] += w * c.mean
-            second[np.ix_(c.active, c.active)] += w * (c.covariance + np.outer(c.mean, c.mean))
+        average = _moments(self._sets, ((w, c, chance) for w, (_, c, _, chance) in zip(weight, seen, strict=True)))
         there = np.array([v[2].tau > 0 for v in seen])
-        return Samples(probability, mean, second - np.outer(mean, mean), there, weight, seen[0][2])
+        return Samples(*average, there, weight, seen[0][2])
 
 
 def sample(sets: Sets, state: State, visits: int, seed: int = 0) -> Samples:
@@ -249,16 +252,7 @@ class _ByStay:
     def moments(self) -> tuple[Array, Array, Array]:
         """Probability (G,) of each group; mean (K,) and covariance (K, K) of the parameters."""
         total = sum(self._seen.values())
-        probability, size = np.zeros(len(self._sets.groups)), self._sets.size
-        mean, second = np.zeros(size), np.zeros((size, size))
-        for key, weight in self._seen.items():
-            c, chance = self._known[key]
-            share = weight / total
-            probability += share * chance
-            if share > LEAST_WEIGHT:
-                mean[c.active] += share * c.mean
-                second[np.ix_(c.active, c.active)] += share * (c.covariance + np.outer(c.mean, c.mean))
-        return probability, mean, second - np.outer(mean, mean)
+        return _moments(self._sets, ((weight / total, *self._known[key]) for key, weight in self._seen.items()))
 
     def there(self) -> tuple[NDArray[np.bool_], Array]:
         """Which groups (S, G) were there in each set, and how much it weighs (S,)."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from processing.errors import ProcessError
 from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects.base import InstrumentEffect, SourceEffect, ValuePerState
-from processing.instrument.model import Belongs, InstrumentModel
+from processing.instrument.model import Belongs, EffectParameter, InstrumentModel
 from processing.instrument.nominal import FIELDS, KIND, shift_nominal
 
 
@@ -117,6 +117,32 @@ class Candidate:
                 (wavelength,) = model.wavelengths_nm or ()
                 values = self.matrix(wavelength) @ values
             self.of_instrument.apply(changes, model, self.place, values)
+
+    @property
+    def scope(self) -> Literal["instrument", "capture"]:
+        """Whether it holds for the instrument or for one capture of it."""
+        return "capture" if self.effect.of_one_capture else "instrument"
+
+    def stored(self, values: Array, stderr: Array) -> dict[str, EffectParameter]:
+        """Values by name as a file stores them, each with its standard error."""
+        if self.effect.is_switch:
+            return {"left_out": EffectParameter(value=1.0, unit="1", note="pixels with a clipped state are left out")}
+        if self.effect.per_state:
+            unit = self.parameters[0].unit
+            return {"states": EffectParameter(value=tuple(values.tolist()), stderr=tuple(stderr.tolist()), unit=unit)}
+        return {
+            p.name: EffectParameter(value=float(v), stderr=float(s), unit=p.unit)
+            for p, v, s in zip(self.parameters, values, stderr, strict=True)
+        }
+
+    def by_wavelength(self, values: Array, covariance: Array) -> Iterator[tuple[Candidate, Array, Array]]:
+        """Itself, its values (n,) and their covariance (n, n); of a curve, each at every one of its wavelengths."""
+        if self.curve is None:
+            yield self, values, covariance
+            return
+        for wavelength in self.curve.wavelengths_nm:
+            mix = self.matrix(wavelength)
+            yield self.at(wavelength), mix @ values, mix @ covariance @ mix.T
 
     @property
     def typical(self) -> Array:

@@ -177,6 +177,11 @@ def beyond_chance(tests: Mapping[str, float]) -> dict[str, float]:
     return two if len(two) > 1 else dict(item for item in in_order if item[1] > LIMIT)
 
 
+def in_words(tests: Mapping[str, float]) -> list[str]:
+    """Sentences about the tests that are beyond chance."""
+    return [f"{name}: {value:.0f} standard deviations above noise" for name, value in beyond_chance(tests).items()]
+
+
 def in_deviations(found: dict[str, tuple[float, float]]) -> tuple[dict[str, float], float]:
     """Tests in standard deviations, of their chi-square beyond noise and its deviation, and the most beyond two."""
     left = max(chi2 - 2 * deviation for chi2, deviation in found.values())

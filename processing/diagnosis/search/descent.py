@@ -38,8 +38,7 @@ def all_at_once(
     values = x[positions]
     for _ in range(EXPANSIONS):
         sums = problem.sums(part, values, derivatives=False)
-        left = float(sums.excess.sum()) + (0.0 if problem.noise_known else float(sums.freedom.sum()))
-        weak = noise.unit(left) / width**2
+        weak = noise.unit(sums.left(problem.noise_known)) / width**2
         new = minimize(problem, part, values, steps=3, expansions=0, weak=weak).values
         moved, values = np.max(np.abs(new - values) / width), new
         if not problem.relinearize(part, values) and moved < SETTLED:

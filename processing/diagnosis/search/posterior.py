@@ -29,7 +29,7 @@ from processing.diagnosis.search.rules import (
     TAU,
 )
 from processing.diagnosis.search.sets import Group, Sets, State
-from processing.diagnosis.search.space import Problem, Space, Sums
+from processing.diagnosis.search.space import Problem, Space
 
 #: Called with a line that says what is being done.
 Say = Callable[[str], None]
@@ -92,7 +92,8 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     members, groups = grouped(space, fixed)
     bends = [g for g, own in enumerate(members) if space.candidates[own[0]].is_pointwise]
     about, sets, state, others = _found(problem, space, fixed, groups, start=start, bends=bends)
-    samples = _averaged(sets, state)
+    # Where what is left is the noise, each set has a unit of its own, and counts by its evidence.
+    samples = stay(sets, state, CHANGES) if sets.noise.known else sample(sets, state, SAMPLES)
     there = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(there) or 'nothing'}; unit of chi-square {state.unit:.3g}")
     return _posterior_of(problem, space, members, sets, samples=samples, about=about, others=others)
@@ -116,30 +117,6 @@ class _Round:
 Look = Callable[[Array], _Round | None]
 
 
-def _looking(
-    problem: Problem,
-    space: Space,
-    groups: Sequence[Group],
-    climbed: Callable[[Sets], State],
-) -> Look:
-    """What linearizes a problem and finds a set."""
-
-    def look(x: Array) -> _Round | None:
-        problem.relinearize(space, x)
-        sums = problem.sums(space, x)
-        form = quadratic(problem, space, x, sums)
-        if not (np.isfinite(form.excess) and np.all(np.isfinite(form.curvature))):
-            return None
-        sets = Sets(form, groups, noise_of(problem, sums))
-        return _Round(x, form.at(x / space.joined("typical")), sets, climbed(sets))
-
-    return look
-
-
-def _total(problem: Problem, sums: Sums) -> float:
-    return float(sums.excess.sum()) + (0.0 if problem.noise_known else float(sums.freedom.sum()))
-
-
 def _found(
     problem: Problem,
     space: Space,
@@ -150,7 +127,16 @@ def _found(
     bends: Sequence[int],
 ) -> tuple[Array, Sets, State, dict[int, tuple[int, ...]]]:
     """Values (K,) about which it was linearized, the sets there, the likeliest of them, and what does as well."""
-    look = _looking(problem, space, groups, likely_set)
+
+    def look(x: Array) -> _Round | None:
+        problem.relinearize(space, x)
+        sums = problem.sums(space, x)
+        form = quadratic(problem, space, x, sums)
+        if not (np.isfinite(form.excess) and np.all(np.isfinite(form.curvature))):
+            return None
+        sets = Sets(form, groups, noise_of(problem, sums))
+        return _Round(x, form.at(x / space.joined("typical")), sets, likely_set(sets))
+
     first = look(start)
     assert first is not None, "the instrument as declared has no intensities"
     begun: list[_Round | None] = [first]
@@ -217,11 +203,6 @@ def _settled(problem: Problem, space: Space, first: _Round, look: Look, *, round
     return now
 
 
-def _averaged(sets: Sets, state: State) -> Samples:
-    """Average over sets; where what is left is the noise each has a unit of its own, and counts by its evidence."""
-    return stay(sets, state, CHANGES) if sets.noise.known else sample(sets, state, SAMPLES)
-
-
 def _posterior_of(
     problem: Problem,
     space: Space,
@@ -235,7 +216,7 @@ def _posterior_of(
     """The posterior of a problem linearized `about` values (K,)."""
     typical, values = space.joined("typical"), mean_over_sets(space, samples, np.ones(space.size))
     there = problem.sums(space, values, derivatives=False)
-    if not sets.noise.unit(_total(problem, there)) <= GROWTH * sets.noise.unit(sets.form.at(values / typical)):
+    if not sets.noise.unit(there.left(problem.noise_known)) <= GROWTH * sets.noise.unit(sets.form.at(values / typical)):
         # The least certain values lie along a bent valley, in which the straight line to their mean does not stay.
         values = improved(problem, space, sets.groups, samples, starts=[about], steps=2 * STEPS)
     return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical), others)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import permutations
+
 import numpy as np
 
 from processing.arrays import Array
@@ -29,6 +32,12 @@ def part_outside(a: Array, b: Array) -> float:
     """Part of a signature a (L, K) that another one, b (L, M), does not reach: the sine of their angle."""
     u, norm = range_of(b, LEAST_OF_SIGNATURE), float(np.linalg.norm(a))
     return float(np.linalg.norm(a - u @ (u.T @ a)) / norm) if norm else 0.0
+
+
+def least_apart(signatures: Sequence[Array]) -> float:
+    """Smallest sine between two of some signatures (L, K), one where there are not two."""
+    pairs = permutations(signatures, 2)
+    return min((part_outside(first, second) for first, second in pairs), default=1.0)
 
 
 def rank_of(a: Array) -> int:

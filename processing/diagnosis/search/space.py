@@ -44,6 +44,10 @@ class Sums:
         gradient, stretch = np.zeros((2, f, k))
         return cls(a, b, c, d, gradient, np.zeros((f, k, k)), stretch, np.zeros((captures, 4, f)))
 
+    def left(self, noise_known: bool) -> float:
+        """Chi-square beyond noise; all of it where the noise is not known."""
+        return float(self.excess.sum()) + (0.0 if noise_known else float(self.freedom.sum()))
+
     def add(self, capture: int, part: Sums, acting: Acting) -> None:
         """Add the sums of one capture, derived by what is `acting` on it."""
         self.excess += part.excess

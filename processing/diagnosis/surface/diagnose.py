@@ -12,11 +12,11 @@ from processing.computing.blas import one_blas_thread
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes, would_be_seen
 from processing.diagnosis.search.correction import solution
-from processing.diagnosis.search.decision import Judgement, beyond_chance
+from processing.diagnosis.search.decision import Judgement, beyond_chance, in_words
 from processing.diagnosis.search.fit import Fit, Solution
 from processing.diagnosis.search.names import AT_BOUND, Names, at_bound, with_parts
 from processing.diagnosis.search.posterior import Posterior, Say, posterior
-from processing.diagnosis.search.range_of import part_outside, rank_of
+from processing.diagnosis.search.range_of import least_apart, rank_of
 from processing.diagnosis.search.result import CaptureReport, Correction, Diagnosis
 from processing.diagnosis.search.rules import APART, LIKELY, LIMIT, SHOWN
 from processing.diagnosis.search.space import Space
@@ -134,9 +134,9 @@ def _told(
     told = answer.told(
         recommended=next_step,
         descriptions=[
-            f"{data.name}: {name}, {value:.0f} standard deviations above noise"
+            f"{data.name}: {line}"
             for data, tests in zip(problem.captures, after, strict=True)
-            for name, value in beyond_chance(tests).items()
+            for line in in_words(tests)
         ],
         captures=[_capture(problem, k, kept, before[k], after=after[k]) for k in range(len(problem.captures))],
         unseen=unobservable(problem, answer.found),
@@ -204,11 +204,7 @@ def _apart(problem: SurfaceProblem, space: Space, fit: Fit, rivals: Sequence[Can
             here = problem.pixels(k, Space(()), np.zeros(0))
             parts.append(problem.derivatives(k, alone, np.zeros(alone.size), here)[0].reshape(alone.size, -1))
         signatures.append(np.concatenate(parts, axis=1).T)
-    smallest = 1.0
-    for i, first in enumerate(signatures):
-        for second in signatures[i + 1 :]:
-            smallest = min(smallest, part_outside(first, second), part_outside(second, first))
-    return smallest
+    return least_apart(signatures)
 
 
 def constants(problem: SurfaceProblem, space: Space, values: Array) -> dict[str, float]:

@@ -7,7 +7,7 @@ is both coefficients, are free at every pixel and projected out, exactly as a fr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -246,12 +246,9 @@ class SurfaceProblem:
     def derivatives(self, k: int, space: Space, values: Array, here: SurfacePixels) -> tuple[Array, Array]:
         """Derivatives (K, P, L) of the residual by every value, and (K, P) of the noise that is expected in it."""
         d, less = np.empty((space.size, *here.residual.shape)), np.empty((space.size, len(here.most)))
-        typical, tile = space.joined("typical"), self.captures[k].tile
+        tile = self.captures[k].tile
         before, noise = _left(here.strength * here.most, tile), self.noise[k].mean(axis=1)
-        for j in range(space.size):
-            moved, step = values.copy(), STEP * typical[j]
-            moved[j] += step
-            columns, flat, light = self._columns(k, space, moved)
+        for j, (step, columns, flat, light) in enumerate(self._moved(k, space, values)):
             change = (columns - here.columns) * here.alpha_0[:, None] + (flat - here.flat) * here.alpha_id[:, None]
             d[j] = -here.outside(change + light - here.extra) / step
             strength = np.sqrt(
@@ -260,6 +257,13 @@ class SurfaceProblem:
             less[j] = noise * (_left(strength * here.most, tile) - before) / step
         return d, less
 
+    def _moved(self, k: int, space: Space, values: Array) -> Iterator[tuple[float, Array, Array, Array]]:
+        """A small step of each value in turn, and the columns and the light of a capture after it."""
+        for j, step in enumerate(STEP * space.joined("typical")):
+            moved = values.copy()
+            moved[j] += step
+            yield step, *self._columns(k, space, moved)
+
     def time_noise(self, space: Space, values: Array) -> Array:
         """None of these effects has a value for each state."""
         return np.zeros(space.size)
@@ -267,20 +271,12 @@ class SurfaceProblem:
     def noise_information(self, space: Space, values: Array) -> Array:
         """Part (K, K) of the curvature that comes from the noise of alpha_0 and tells nothing about the values."""
         out = np.zeros((space.size, space.size))
-        if not space.size:
-            return out
-        typical = space.joined("typical")
         for k in range(len(self.captures)):
             here = self.pixels(k, space, values)
-            d = np.zeros((space.size, *here.residual.shape))
-            for j in range(space.size):
-                moved = values.copy()
-                moved[j] += STEP * typical[j]
-                columns, _, _ = self._columns(k, space, moved)
-                d[j] = here.outside(columns - here.columns) / (STEP * typical[j])
             free = (1 - here.hold) / np.where(here.strength > 0, here.strength, np.inf)
-            d *= free[:, None]
-            flat = d.reshape(space.size, -1)
+            moved = self._moved(k, space, values)
+            d = [here.outside(columns - here.columns) * free[:, None] / step for step, columns, _, _ in moved]
+            flat = np.reshape(d, (space.size, here.residual.size))
             out += flat @ flat.T
         return out
 

@@ -29,7 +29,6 @@ from processing.diagnosis.search.result import (
 )
 from processing.diagnosis.search.rules import MOST_RANKED, MOST_TRIED, NEEDED, SEEN, SMALL
 from processing.diagnosis.search.space import Problem, Space
-from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel, SystematicError
 
 #: [correlation] From which on two values are told together.
@@ -180,7 +179,7 @@ def told_effects(
     each = [
         at
         for found in zip(cause.candidates, cause.values, cause.covariance, strict=True)
-        for at in by_wavelength(*found)
+        for at in found[0].by_wavelength(*found[1:])
     ]
     sizes = [shown(values, covariance) for _, values, covariance in each]
     for (candidate, values, covariance), size in zip(each, sizes, strict=True):
@@ -190,10 +189,10 @@ def told_effects(
             FoundEffect(
                 kind=candidate.kind,
                 element=candidate.place or None,
-                parameters=parameters_of(candidate, values, np.sqrt(np.diag(covariance))),
+                parameters=candidate.stored(values, np.sqrt(np.diag(covariance))),
                 evidence=2 * cause.log_odds,
                 indistinguishable_from=tuple(dict.fromkeys(c.short for c in cause.alternatives)),
-                scope=scope_of(candidate),
+                scope=candidate.scope,
                 capture=None if candidate.capture is None else problem.captures[candidate.capture].name,
                 wavelength_nm=candidate.wavelength_nm,
                 removal_chance=1 - probability,
@@ -376,15 +375,15 @@ class Answer:
             if candidate in solved.base.candidates:
                 continue
             covariance = found.covariance[part[candidate], part[candidate]]
-            for one, values, own in by_wavelength(candidate, solved.fit.values[where], covariance):
+            for one, values, own in candidate.by_wavelength(solved.fit.values[where], covariance):
                 effects.append(
                     AppliedEffect(
                         kind=one.kind,
                         element=one.place or None,
-                        parameters=parameters_of(one, values, np.sqrt(np.maximum(np.diag(own), 0.0))),
+                        parameters=one.stored(values, np.sqrt(np.maximum(np.diag(own), 0.0))),
                         probability=float(chance[candidate]),
                         captures=tuple(c.name for k, c in enumerate(captures) if one.acts(k, c.wavelength_nm)),
-                        scope=scope_of(one) if lasts else "capture",
+                        scope=one.scope if lasts else "capture",
                         wavelength_nm=_wavelength(self.problem, one),
                     )
                 )
