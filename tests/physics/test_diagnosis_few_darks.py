@@ -1,4 +1,4 @@
-"""Two dark frames only: their noise is the same in every state, and is no fault of the instrument."""
+"""Noise of few dark frames, and the rounding of counts: both are alike in many values, and are no fault."""
 
 import numpy as np
 import pytest
@@ -49,10 +49,18 @@ def test_noise_of_two_darks_is_expected_in_the_residual(kind, unknowns, syntheti
     assert (left**2).sum() / (3000 * variance) == pytest.approx(1, abs=3 * np.sqrt(2 / freedom))
 
 
-@pytest.mark.parametrize("darks", [1, 4])
-@pytest.mark.parametrize("texture", [0.0, 0.5])
-def test_noise_of_darks_is_no_fault_where_states_are_dark(darks, texture, synthetic_capture, configs):
+SIXTEEN_BITS = 2.1, 4.0, 600.0, 16
+# 0.24 and 0.15 counts of read noise: whole counts are off by up to a half, in all pixels alike.
+EIGHT_BITS, QUIET = (490.0, 118.0, 8.4, 8), (490.0, 74.0, 8.6, 8)
+
+
+@pytest.mark.parametrize(
+    ("camera", "darks", "texture"),
+    [(SIXTEEN_BITS, 1, 0.0), (SIXTEEN_BITS, 4, 0.5), (EIGHT_BITS, 1, 0.5), (EIGHT_BITS, 4, 0.0), (QUIET, 4, 0.0)],
+)
+def test_noise_of_darks_is_no_fault_where_states_are_dark(camera, darks, texture, synthetic_capture):
     """Crossed polarizers let no light through in six of these states: the read-out and the darks are all the noise."""
+    gain, read, black, bits = camera
     turned = 4.5 * np.arange(40)
     file = synthetic_capture.folder / "crossed.yaml"
     file.write_text(CROSSED)
@@ -63,14 +71,15 @@ def test_noise_of_darks_is_no_fault_where_states_are_dark(darks, texture, synthe
     scene = 40_000 * (1 + texture * np.sin(np.arange(64) / 3) * np.cos(np.arange(48) / 5)[:, None])
     electrons = random.poisson(np.maximum(light, 0)[:, None, None, None] * scene)
     frames = np.concatenate([np.zeros((darks, 1, 48, 64)), electrons])
-    frames = frames + random.normal(0, 4, frames.shape)
+    frames = frames + random.normal(0, read, frames.shape)
     path = synthetic_capture(
-        np.round(frames / 2.1 + 600).astype(np.uint16),
+        np.round(frames / gain + black).astype(np.uint16),
         {axis: np.r_[np.zeros(darks), a] for axis, a in angles.items()},
         role=("dark",) * darks + ("sample",) * 40,
         sample={"kind": "air"},
         instrument_yaml=CROSSED,
-        detector={"gain_e_per_count": 2.1, "read_noise_e": 4.0, "bits": 16},
+        detector={"gain_e_per_count": gain, "read_noise_e": read, "bits": bits},
     )
     found = diagnose_captures([path], model)[0].diagnosis
-    assert (found.verdict, found.effects, found.noise.verdict) == ("consistent", (), "as_declared")
+    assert (found.verdict, found.effects) == ("consistent", ())
+    assert camera != SIXTEEN_BITS or found.noise.verdict == "as_declared"

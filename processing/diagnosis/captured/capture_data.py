@@ -27,14 +27,12 @@ class SharedNoise:
     ----------
     right, down : part of the next pixel that was mixed into each, 0 to 0.5 (resampled or smoothed images).
     rows, columns : variance common to a row, or a column, of a frame, over that of a pixel.
-    wide : variance of a pattern as wide as the image over what independent pixels would give it.
     """
 
     right: float = 0.0
     down: float = 0.0
     rows: float = 0.0
     columns: float = 0.0
-    wide: float = 1.0
 
     @property
     def shown(self) -> float:
@@ -91,6 +89,8 @@ class CaptureData:
     steep : (rows, columns) True where a pixel is left out because it lies at a sharp edge; None: nowhere.
     cut_off : numbers of states that do not count because their counts are cut off at zero.
     shared : what pixels have of their noise in common; slope and floor are those of wide patterns.
+    wide : (N,) variance of a pattern as wide as the image over what independent pixels would give it; None: 1.
+    rounding : (N,) variance that the rounding of counts gives the mean of all pixels, which no number of them averages.
     evidence : what speaks against its frames, as a camera that was frozen, in sentences.
     noise_told : what patterns of the noise are not declared, in sentences; white_told : how its variance differs, which
         holds while `noise_factors` are not one.
@@ -128,6 +128,8 @@ class CaptureData:
     place_px: Array | None = None
     left_out: LeftOut = field(default_factory=LeftOut)
     shared: SharedNoise = field(default_factory=SharedNoise)
+    wide: Array | None = None
+    rounding: Array | None = None
     noise_told: tuple[str, ...] = ()
     evidence: tuple[str, ...] = ()
     white_told: str | None = None
@@ -155,6 +157,11 @@ class CaptureData:
         counts = np.ones(self.conditions.states, dtype=bool)
         counts[[*self.cut_off, *self.left_out.frames]] = False
         return np.repeat(counts, self.signal.shape[1])
+
+    @property
+    def row_wide(self) -> Array:
+        """`wide` (values_per_pixel,) of each row of W."""
+        return np.ones(self.values_per_pixel) if self.wide is None else np.repeat(self.wide, self.signal.shape[1])
 
     @property
     def row_moved_px(self) -> Array:

@@ -15,7 +15,6 @@ from processing.diagnosis.search.rules import OUTSTANDING
 from processing.instrument.model import InstrumentModel
 from processing.reduction.black import Black
 from processing.reduction.measurement_matrix import measurement_matrix
-from processing.reduction.noise import NoiseModel
 from processing.storage.captures.capture import Capture
 
 #: [of the noise of one state] Noise of the dark frames, over all states of a pixel, that changes nothing.
@@ -29,7 +28,7 @@ def without_noise_of_darks(
     *,
     states: NDArray[np.int64],
     black: Black,
-    noise: NoiseModel,
+    variance: Array,
 ) -> CaptureData:
     """The capture without the noise that its dark frames add to all states of a pixel.
 
@@ -42,10 +41,11 @@ def without_noise_of_darks(
     data : its `floor` is the noise of each state alone.
     model : of the capture, at its wavelength.
     states : (N,) numbers of the states of `data` in the capture.
+    variance : (D,) of the means of the dark frames of each exposure, counts^2.
     """
     channels, counts = data.signal.shape[1], data.row_counts
     good = data.usable & ~data.clipped
-    dark_sd = np.sqrt(black.mean_variance(noise)) / data.conditions.full_scale / data.binned
+    dark_sd = np.sqrt(variance) / data.conditions.full_scale / data.binned
     if not good.any() or not dark_sd.any():
         return data
     y = data.signal.reshape(-1, *data.usable.shape)

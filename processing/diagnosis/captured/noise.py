@@ -28,6 +28,7 @@ from processing.diagnosis.search.rules import (
     SMALL,
 )
 from processing.instrument.grammar import TIMES, course
+from processing.reduction.noise import QUANTIZATION
 from processing.storage.captures.capture import CaptureError
 
 #: [intensities of a pixel] Up to which every row tells noise that has any: there are no others.
@@ -113,6 +114,8 @@ MOST_VALUES = 4_000_000
 LEAST_PART = 0.01
 #: [of the signal] Scatter of pixels below which it is that of rounded numbers.
 ROUNDING = 1e-6
+#: [of the variance of a wide pattern] What rounding adds, below which it changes nothing.
+ROUNDING_SEEN = 1e-3
 #: [unit of chi-square] Weight of the belief that both parts of the noise are as declared, where the images do not tell
 #: them apart.
 WEAK = 1e-3
@@ -314,7 +317,7 @@ def _dim_levels(y: NDArray[np.float32], count: float) -> tuple[Array, float]:
     Quantization Noise, Cambridge 2008, chapter 4).
     """
     # Pixels differ in all states alike: that is no noise, though it spreads the counts.
-    spread = np.maximum(y.var(axis=1, dtype=np.float64) / count**2 - 1 / 12, 0.0)
+    spread = np.maximum(y.var(axis=1, dtype=np.float64) / count**2 - QUANTIZATION, 0.0)
     own = y - y.mean(axis=0, dtype=np.float64)
     middle = np.median(own, axis=1, keepdims=True)
     scatter = np.median(np.abs(own - middle), axis=1, keepdims=True) / NORMAL_MAD
@@ -384,8 +387,8 @@ def checked_noise(data: CaptureData, a: Array) -> CaptureData:
             f"resampled or smoothed, and of {1 / shared.shown:.1f} pixels one is independent"
         )
     if found.rows or found.columns:
-        shared = _with_lines(shared, found, data)
-    lines = _lines(shared, data)
+        shared = replace(shared, rows=found.rows, columns=found.columns)
+    lines, wide = _lines(shared, data), _wide(shared, data)
     for name, part in zip(("row", "column"), lines, strict=True):
         if part > 0:
             told.append(_in_counts(f"every {name} of a frame has an offset of its own", part, data))
@@ -394,7 +397,8 @@ def checked_noise(data: CaptureData, a: Array) -> CaptureData:
     if not data.noise_estimated and factors != (1.0, 1.0):
         white = _white_in_words(data, found.white / shared.shown, shot, dark)
     # What is common to a line is a part of the variance of its pixels, and more of that of wide patterns.
-    slope, floor = data.slope * shot * shared.wide, (data.floor * dark + sum(lines)) * shared.wide
+    slope, floor = data.slope * shot * wide, (data.floor * dark + sum(lines)) * wide
+    data = replace(data, wide=None if np.all(wide == 1) else wide)
     return replace(
         data, slope=slope, floor=floor, shared=shared, noise_factors=factors, noise_told=tuple(told), white_told=white
     )
@@ -415,10 +419,15 @@ def _part(alike: float) -> float:
     return float((1 - np.sqrt(1 - 4 * product)) / 2)
 
 
-def _with_lines(shared: SharedNoise, found: DetectorNoise, data: CaptureData) -> SharedNoise:
+def _wide(shared: SharedNoise, data: CaptureData) -> Array:
+    """Variance (N,) of a pattern as wide as the image over what independent pixels would give it."""
     height, width = data.usable.shape
-    wide = 1 + found.rows * width + found.columns * height
-    return replace(shared, rows=found.rows, columns=found.columns, wide=wide)
+    lines = np.full(len(data.slope), 1 + shared.rows * width + shared.columns * height)
+    if data.rounding is None:
+        return lines
+    variance = data.variance_of(data.usable).mean(axis=(1, 2))
+    rounding = data.usable.sum() * data.rounding / np.maximum(variance, data.floor)
+    return lines + np.where(rounding > ROUNDING_SEEN, rounding, 0.0)
 
 
 def _lines(shared: SharedNoise, data: CaptureData) -> tuple[float, float]:

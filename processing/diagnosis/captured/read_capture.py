@@ -17,6 +17,7 @@ from processing.diagnosis.captured.averaged import means, side_for, squares
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.dark_noise import without_noise_of_darks
 from processing.diagnosis.captured.noise import estimated_noise
+from processing.diagnosis.captured.rounding import Rounding
 from processing.diagnosis.search.rules import (
     FEWEST_PIXELS,
     LIMIT,
@@ -55,6 +56,8 @@ class Frames:
     clipped : (rows, columns) some pixel of the square is at the top of the range in some state.
     clipped_states : (N,) in which some pixel is.
     zero : (N, rows, columns) some pixel of the square is cut off at zero; zero_share : (N,) share of the pixels.
+    rounding : (N,) variance, counts^2, that rounding gives the mean of all pixels, which more of them do not average.
+    part : (N,) variance of a pixel over that with independent errors of rounding; of_black : (D,) of dark frames.
     """
 
     counts: NDArray[np.float32]
@@ -64,6 +67,9 @@ class Frames:
     zero: NDArray[np.bool_]
     zero_share: NDArray[np.float64]
     side: int
+    rounding: Array
+    part: Array
+    of_black: Array
 
 
 def read_frames(
@@ -77,12 +83,16 @@ def read_frames(
     clipped: list[NDArray[np.bool_]] = []
     zero: list[NDArray[np.bool_]] = []
     share, tops, side = np.zeros(len(states)), [], 1
+    rounding, of_rounding = Rounding(capture, split.planes, correction.black), []
     for n, k in enumerate(states):
         frame = capture.frames(int(k)).astype(np.float32)
         over = split.any_of(frame >= (np.inf if level is None else level))
         under = split.any_of((frame <= 0) & has_zero)
+        shift, unsure, part = rounding.of_frame(int(k), frame)
         frame -= correction.black.at(exposure[n])
         planes = split.planes(frame if correction.flat is None else frame / correction.flat.response)
+        planes = planes + shift.astype(np.float32)[:, None, None] if shift.any() else planes
+        of_rounding.append((unsure.max(), part.mean()))
         side = _side(len(states) * len(planes), *planes.shape[1:])
         tops.append(float(planes.max(initial=-np.inf, where=np.isfinite(planes))))
         share[n] = under.mean()
@@ -98,6 +108,9 @@ def read_frames(
         zero=np.stack(zero),
         zero_share=share,
         side=side,
+        rounding=np.array(of_rounding)[:, 0],
+        part=np.array(of_rounding)[:, 1],
+        of_black=rounding.of_black[:, 3].mean(axis=1),
     )
 
 
@@ -198,6 +211,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         binned=side,
         pitch=model.pitch * side,
         place_px=_places_px(capture.seen(model), side),
+        rounding=frames.rounding / top**2,
         cut_off=tuple(np.flatnonzero(cut_off).tolist()),
     )
     repeats = np.maximum(capture.column("repeats")[states].astype(float), 1)
@@ -205,10 +219,12 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     if noise is not None:
         excess = correction.black.excess(noise, capture.column("exposure_s")[states])
         slope, floor = noise.slope / repeats / top, noise.averaged_floor(repeats, excess) / top**2
-        data = replace(data, slope=slope / side**2, floor=floor / side**2, noise_known=True, noise_source=noise.source)
+        slope, floor = slope * frames.part / side**2, floor * frames.part / side**2
+        data = replace(data, slope=slope, floor=floor, noise_known=True, noise_source=noise.source)
     stated = capture.sigma
     if noise is not None and stated is None:
-        data = without_noise_of_darks(data, capture, model, states=states, black=correction.black, noise=noise)
+        of_means = correction.black.mean_variance(noise) * frames.of_black
+        data = without_noise_of_darks(data, capture, model, states=states, black=correction.black, variance=of_means)
     if stated is not None:
         floor = (stated[states] / top / side) ** 2
         data = replace(

@@ -99,11 +99,11 @@ def derivatives_of_part(u: NDArray[np.floating], rows: slice, columns: slice) ->
 def shared_noise(x_px: float, y_px: float, mixed: SharedNoise = NOTHING_SHARED) -> Array:
     """Covariance (6, 6) of the noise of a pixel and its derivatives in a frame that was moved back by so many pixels.
 
-    For unit noise of wide patterns, which moving the frame, and what was `mixed` before, make alike among neighbours.
+    For unit noise of single pixels, which moving the frame, and what was `mixed` before, make alike among neighbours.
     """
     across = np.stack([np.convolve(kernel, noise_taps(x_px, mixed.right)) for _, kernel in PATTERNS])
     down = np.stack([np.convolve(kernel, noise_taps(y_px, mixed.down)) for kernel, _ in PATTERNS])
-    out = np.asarray((across @ across.T) * (down @ down.T) / mixed.wide)
+    out = np.asarray((across @ across.T) * (down @ down.T))
     out.flags.writeable = False
     return out
 

@@ -68,7 +68,7 @@ def with_noise_of_light(data: CaptureData, a: Array, bends: Mapping[Candidate, A
     ----------
     data : not moved; a (L, K) : rows of its model, not weighted.
     """
-    shared = data.shared.shown < 1 or data.shared.wide > 1
+    shared = data.shared.shown < 1 or data.wide is not None
     if not data.noise_known or data.noise_estimated or shared:
         return _of_light(data, bends)
     least, usual = max(abs(data.noise_level[0] - 1), GAIN_OFF), (1.0, 1.0)

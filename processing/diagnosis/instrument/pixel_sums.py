@@ -69,7 +69,8 @@ class Pixels:
         self.u = data.signal.reshape(-1, *data.signal.shape[2:])
         self._slope, self._floor = np.repeat(data.slope, channels), np.repeat(data.floor, channels)
         self._true = None if data.true_variance is None else data.true_variance.reshape(self.u.shape)
-        self.shared = np.stack([shared_noise(x, y, data.shared) for x, y in data.row_moved_px])
+        alike = np.stack([shared_noise(x, y, data.shared) for x, y in data.row_moved_px])
+        self.shared = alike / data.row_wide[:, None, None]
         self.scale = np.asarray(sum(self.variance_of(k) for k in range(len(self.u))) / len(self.u))
         self.good = data.usable & (self.scale > 0) & inside(*self.u.shape[1:])
 

@@ -144,7 +144,7 @@ def _alike(data: CaptureData) -> Array:
     """Covariance (L, 2) of the noise of neighbours down and across, in units of that of wide patterns."""
     shared = data.shared
     moved = np.array([neighbour_noise(x, y, shared.right, shared.down) for x, y in data.row_moved_px])
-    return np.asarray((moved + np.array([shared.columns, shared.rows])) / shared.wide)
+    return np.asarray((moved + np.array([shared.columns, shared.rows])) / data.row_wide[:, None])
 
 
 def _around(signal: NDArray[np.float32]) -> NDArray[np.float32]:
