@@ -2,7 +2,9 @@
 
 import contextlib
 from collections.abc import Callable
-from typing import Protocol, TypeVar
+from typing import TypeVar
+
+from pydantic import Field
 
 from drivers.prompt_line import prompt_framer
 from drivers.serial_link import LineRegistry, SerialLink
@@ -10,11 +12,10 @@ from drivers.source import LightSource, PortSource, SourceConfig
 from drivers.sources import sc10
 
 
-class ShutteredConfig(SourceConfig, Protocol):
+class ShutteredConfig(SourceConfig):
     """What the rig file says of such a source."""
 
-    @property
-    def shutter(self) -> sc10.Config | None: ...
+    shutter: sc10.Config | None = Field(default=None, description="SC10 shutter beside it")
 
 
 class ShutteredSource(PortSource):

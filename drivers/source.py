@@ -2,10 +2,11 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from typing import Protocol
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from drivers.errors import DeviceError
-from drivers.serial_link import LineRegistry, PortConfig
+from drivers.serial_link import LineRegistry
 
 
 def check_wavelengths(places: Mapping[float, int], what: str, others: Iterable[float] = ()) -> None:
@@ -110,11 +111,15 @@ class LightSource(ABC):
         )
 
 
-class SourceConfig(PortConfig, Protocol):
-    """What a rig file says of a source behind a port."""
+class SourceConfig(BaseModel):
+    """What every kind of source behind a port has in a rig file."""
 
-    @property
-    def kind(self) -> str: ...
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: str
+    port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
+    held_by: str | None = Field(default=None, description="program that may hold the port too: its simulator")
+    reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
 
 
 class PortSource(LightSource):

@@ -12,11 +12,11 @@ query waits for the end of a move.
 import re
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from drivers.errors import CommandRejected, DeviceError, WrongDevice
 from drivers.serial_link import LineRegistry, SerialLink, agreed, line_framer
-from drivers.source import PortSource
+from drivers.source import PortSource, SourceConfig
 from drivers.unmarked_replies import ask, text_of
 
 ERRORS = {1: "command not understood", 2: "bad parameter", 3: "destination not allowed", 8: "cannot home the drive"}
@@ -27,18 +27,13 @@ _SHUTTER = re.compile(r"[CO]")
 _INFO = re.compile(r"(?=.*[a-zA-Z]).+[^?]")
 
 
-class Config(BaseModel):
+class Config(SourceConfig):
     """Cornerstone in a rig file."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     kind: Literal["cornerstone"] = "cornerstone"
-    port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
-    held_by: str | None = Field(default=None, description="program that may hold the port too: its simulator")
     range_nm: tuple[float, float] = Field(description="wavelengths that its gratings are used for, nm")
     baudrate: int = Field(default=9600, description="bits a second, as the instrument is set")
     tolerance_nm: float = Field(default=0.1, gt=0, description="largest allowed distance from the wavelength, nm")
-    reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
     move_s: float = Field(default=30.0, gt=0, description="longest time for the gratings and the shutter to move")
 
 

@@ -12,12 +12,12 @@ word that `MODe?` answers, and USBTMC as a whole, which no emulator here speaks.
 import re
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from drivers.errors import CommandRejected, DeviceError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.message_device import MessageDevice
 from drivers.serial_link import LineRegistry
-from drivers.source import PortSource, check_wavelengths
+from drivers.source import PortSource, SourceConfig, check_wavelengths
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _STATE = re.compile(r"0|1|ON|OFF", re.IGNORECASE)
@@ -26,19 +26,15 @@ _IDENTITY = re.compile(r"[^,]+,[^,]+,[^,]+,[^,]+")
 _MODE = re.compile(r"\w+")
 
 
-class Config(BaseModel):
+class Config(SourceConfig):
     """DC2200 in a rig file."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["dc2200"] = "dc2200"
     port: str = Field(description="device file, such as /dev/usbtmc0")
-    held_by: str | None = Field(default=None, description="program that may hold it too: its simulator")
     terminals: dict[float, Literal[1, 2]] = Field(min_length=1, description="wavelength in nm to terminal of its LED")
     percent: dict[float, Annotated[float, Field(ge=0, le=100)]] = Field(
         default={}, description="brightness by wavelength in nm, set when that is selected"
     )
-    reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
 
     @model_validator(mode="after")
     def _one_led_for_each_wavelength(self) -> Self:

@@ -14,11 +14,11 @@ import re
 from functools import partial
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from drivers.errors import CommandRejected, DeviceError, ReplyError, WrongDevice
 from drivers.serial_link import LineRegistry, SerialLink, agreed, line_framer
-from drivers.source import PortSource, check_wavelengths
+from drivers.source import PortSource, SourceConfig, check_wavelengths
 from drivers.unmarked_replies import ask, text_of
 
 BAUDRATE = 115200
@@ -41,21 +41,16 @@ def open_led(channel: int) -> int:
     return 1 << (13 + 2 * channel)
 
 
-class Config(BaseModel):
+class Config(SourceConfig):
     """DC4100 in a rig file."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     kind: Literal["dc4100"] = "dc4100"
-    port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
-    held_by: str | None = Field(default=None, description="program that may hold the port too: its simulator")
     channels: dict[float, Annotated[int, Field(ge=1, le=4)]] = Field(
         default={}, description="wavelength in nm to channel 1 to 4; empty: as the LEDs say themselves"
     )
     percent: dict[float, Annotated[float, Field(ge=0, le=100)]] = Field(
         default={}, description="brightness by wavelength in nm, set when that is selected"
     )
-    reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
 
     @model_validator(mode="after")
     def _one_led_for_each_wavelength(self) -> Self:

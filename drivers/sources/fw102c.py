@@ -10,12 +10,12 @@ blocked answers.
 
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from drivers.errors import DeviceError, WrongDevice
 from drivers.prompt_line import PromptLine
 from drivers.serial_link import LineRegistry, SerialLink
-from drivers.shuttered_source import ShutteredSource, open_beside
+from drivers.shuttered_source import ShutteredConfig, ShutteredSource, open_beside
 from drivers.source import LightSource, check_wavelengths
 from drivers.sources import sc10
 
@@ -24,18 +24,13 @@ MODELS = ("FW102C", "FW212C")
 Position = Annotated[int, Field(ge=1, le=12)]
 
 
-class Config(BaseModel):
+class Config(ShutteredConfig):
     """FW102C in a rig file; light is shut off by an opaque filter (`dark_position`) or by a shutter beside it."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     kind: Literal["fw102c"] = "fw102c"
-    port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
-    held_by: str | None = Field(default=None, description="program that may hold the port too: its simulator")
     positions: dict[float, Position] = Field(min_length=1, description="wavelength in nm to position on the wheel")
     dark_position: Position | None = Field(default=None, description="position of an opaque filter")
     shutter: sc10.Config | None = Field(default=None, description="SC10 shutter beside the wheel")
-    reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
     turn_s: float = Field(default=8.0, gt=0, description="longest time for the wheel to turn")
 
     @model_validator(mode="after")

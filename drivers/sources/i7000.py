@@ -9,29 +9,24 @@ answered with ``!`` and ignored.
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from drivers.errors import CommandRejected, DeviceError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.serial_link import LineRegistry, SerialLink, line_framer
-from drivers.source import PortSource
+from drivers.source import PortSource, SourceConfig
 
 BAUDRATE = 9600
 
 
-class Config(BaseModel):
+class Config(SourceConfig):
     """Relay module in a rig file."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     kind: Literal["i7000"] = "i7000"
-    port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
     address: int = Field(default=1, ge=0, le=255, description="address of the module on its line")
     output: int = Field(default=0, ge=0, le=7, description="relay that lets light pass, counted from 0")
     watchdog_s: float | None = Field(
         default=1.0, ge=0.2, le=25.5, description="the module opens the relay after this time without a heartbeat"
     )
-    held_by: str | None = Field(default=None, description="program that may hold the port too: its simulator")
-    reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
 
 
 class RelayModule(PortSource):

@@ -11,12 +11,12 @@ the number of ``OM=1`` (manual), which is that of a public program.
 import re
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from drivers.errors import DeviceError, WrongDevice
 from drivers.prompt_line import PromptLine
 from drivers.serial_link import LineRegistry, SerialLink
-from drivers.shuttered_source import ShutteredSource, open_beside
+from drivers.shuttered_source import ShutteredConfig, ShutteredSource, open_beside
 from drivers.source import LightSource
 from drivers.sources import sc10
 
@@ -29,17 +29,12 @@ _SAME_NM = 0.01
 _NUMBER = r"-?\d+(?:\.\d+)?"
 
 
-class Config(BaseModel):
+class Config(ShutteredConfig):
     """KURIOS in a rig file; light is shut off by the band BLACK, or by a shutter beside the filter."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     kind: Literal["kurios"] = "kurios"
-    port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
-    held_by: str | None = Field(default=None, description="program that may hold the port too: its simulator")
     band: Literal["wide", "medium", "narrow"] = Field(default="wide", description="bandwidth mode")
     shutter: sc10.Config | None = Field(default=None, description="SC10 shutter, where the filter has no band BLACK")
-    reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
     settle_s: float = Field(default=0.3, ge=0, description="time that the liquid crystals take after a change")
 
 

@@ -7,25 +7,20 @@ reads the blade, `interlock?` is 1 while the interlock circuit is open (Thorlabs
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from drivers.errors import CommandRejected, DeviceError, WrongDevice
 from drivers.prompt_line import PromptLine, prompt_framer
 from drivers.serial_link import LineRegistry, SerialLink
-from drivers.source import PortSource
+from drivers.source import PortSource, SourceConfig
 
 BAUDRATE = 9600
 
 
-class Config(BaseModel):
+class Config(SourceConfig):
     """SC10 in a rig file."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     kind: Literal["sc10"] = "sc10"
-    port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
-    held_by: str | None = Field(default=None, description="program that may hold the port too: its simulator")
-    reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
     blade_s: float = Field(default=1.0, gt=0, description="longest time for the blade to open or close")
 
 
