@@ -275,9 +275,14 @@ class MotionAxis(ABC):
         """Warning flags in words; an empty list if there are none. Faults are errors, not warnings."""
         return self._do_warnings()
 
-    @abstractmethod
     def describe(self) -> AxisIdentity:
         """Model, serial number and firmware as read when the axis was opened."""
+        return self._identity
+
+    def _identify(self, *, model: str, serial_number: str, firmware: str, address: str) -> None:
+        """Note what a driver's open() has read, for `describe`."""
+        kind: str = self.config.kind  # type: ignore[attr-defined]  # of every section of a rig file
+        self._identity = AxisIdentity(kind, model, serial_number, firmware, self.config.port, address)
 
     def start_move(self, target_deg: float) -> Motion:
         """Start a move to an absolute user angle in degrees and return at once.

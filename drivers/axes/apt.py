@@ -19,7 +19,7 @@ from pydantic import Field
 from drivers.apt_frames import BAY, RACK, REPLY_NAMES, UNIT, apt_framer, long_message, short_message
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, WrongDevice
-from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.motion import AxisConfig, MotionAxis
 from drivers.serial_link import ControllerLine, LineRegistry, Transcript, agreed
 from drivers.unmarked_replies import ask
 
@@ -154,12 +154,10 @@ class APTAxis(MotionAxis):
         self.speed_deg_s = velocity / self._scale.velocity
         self.acceleration_deg_s2 = acceleration / self._scale.acceleration
         self._home_speed_deg_s = self._read_home_parameters()[2] / self._scale.velocity or self.speed_deg_s
-        self._identity = AxisIdentity(
-            kind=config.kind,
+        self._identify(
             model=model,
             serial_number=str(serial_number),
             firmware=".".join(str(part) for part in reversed(info[14:17])),
-            port=config.port,
             address=f"{self._to:#04x}",
         )
 
@@ -183,9 +181,6 @@ class APTAxis(MotionAxis):
             f"controller {model} with stage id {stage} is not known",
             f"Set `stage` in the rig file to one that counts alike: {', '.join(STAGES)}",
         )
-
-    def describe(self) -> AxisIdentity:
-        return self._identity
 
     def _read_home_parameters(self) -> tuple[int, int, int, int]:
         """Return direction, limit switch, velocity and offset of homing."""

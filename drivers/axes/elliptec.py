@@ -16,7 +16,6 @@ from pydantic import Field
 
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
-from drivers.motion import AxisIdentity
 from drivers.serial_link import ControllerLine, LineRegistry, Transcript, agreed, line_framer
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
 
@@ -175,12 +174,10 @@ class ElliptecAxis(SessionReferenceAxis):
         velocity = int(agreed(lambda: line.ask(self._address, "gv", "GV", 2)), 16)
         self.speed_deg_s = FULL_SPEED_DEG_S * max(velocity, 1) / 100
         self.acceleration_deg_s2 = ACCELERATION_DEG_S2
-        self._identity = AxisIdentity(
-            kind=config.kind,
+        self._identify(
             model=_ROTARY.get(module, f"ELL{module}"),
             serial_number=info[2:10],
             firmware=info[14:16],
-            port=config.port,
             address=self._address,
         )
 
@@ -206,9 +203,6 @@ class ElliptecAxis(SessionReferenceAxis):
             rule = f"address {config.address}, serial_number {config.serial_number}"
             raise WrongDevice(asked, f"{len(wanted)} modules match {rule}; found {listed}", "Correct the rig file")
         return wanted[0]
-
-    def describe(self) -> AxisIdentity:
-        return self._identity
 
     def _do_read_counts(self) -> int:
         value = int(self._line.ask(self._address, "gp", "PO", 8), 16)

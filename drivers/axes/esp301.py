@@ -14,7 +14,6 @@ from pydantic import Field
 from drivers.axis_types import stage_limit
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, WrongDevice
-from drivers.motion import AxisIdentity
 from drivers.serial_link import ControllerLine, LineRegistry, Transcript, agreed, line_framer
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
 from drivers.unmarked_replies import ask, text_of
@@ -118,17 +117,12 @@ class ESP301Axis(SessionReferenceAxis):
         self._device_min_deg = self._limit("SL?")
         self._device_max_deg = self._limit("SR?")
         model, _, serial_number = stage.partition(",")
-        self._identity = AxisIdentity(
-            kind=config.kind,
+        self._identify(
             model=f"{version.split()[0]} stage {model.strip()}",
             serial_number=serial_number.strip(),
             firmware=" ".join(version.split()[1:]),
-            port=config.port,
             address=str(config.axis),
         )
-
-    def describe(self) -> AxisIdentity:
-        return self._identity
 
     def _number(self, command: str) -> float:
         return float(self._line.ask(f"{self.config.axis}{command}", _NUMBER))

@@ -15,7 +15,7 @@ from pydantic import Field
 from drivers.axis_types import stage_limit
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
-from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.motion import AxisConfig, MotionAxis
 from drivers.serial_link import ControllerLine, LineRegistry, Transcript, agreed, line_framer
 from drivers.unmarked_replies import ask, text_of
 
@@ -116,17 +116,7 @@ class GCS2Axis(MotionAxis):
         if min(self.speed_deg_s, self.acceleration_deg_s2) <= 0:
             raise ReplyError(f"{asked}, speed", f"{self.speed_deg_s}, {self.acceleration_deg_s2}", "Set VEL and ACC")
         self._device_min_deg, self._device_max_deg = self._limit("TMN?"), self._limit("TMX?")
-        self._identity = AxisIdentity(
-            kind=config.kind,
-            model=model,
-            serial_number=serial_number,
-            firmware=firmware,
-            port=config.port,
-            address=str(config.axis),
-        )
-
-    def describe(self) -> AxisIdentity:
-        return self._identity
+        self._identify(model=model, serial_number=serial_number, firmware=firmware, address=str(config.axis))
 
     def _number(self, query: str) -> float:
         return float(self._line.ask(f"{query} {self.config.axis}", self._answer).partition("=")[2])

@@ -15,7 +15,6 @@ from pydantic import Field
 
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, WrongDevice
-from drivers.motion import AxisIdentity
 from drivers.serial_link import LineRegistry, Transcript, line_framer
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
 from drivers.text_line import TextLine
@@ -79,17 +78,12 @@ class GSCAxis(SessionReferenceAxis):
         # Of all controllers a GSC-02 alone is told the way home, and drives at a letter without a colon.
         self._drive = "G" if config.home_direction else "G:"
         self._home_speed_deg_s = HOMING_PPS / config.pulses_per_deg
-        self._identity = AxisIdentity(
-            kind=config.kind,
+        self._identify(
             model=f"SHOT controller of {count} axes",
             serial_number="not told by the protocol",
             firmware=firmware,
-            port=config.port,
             address=str(config.axis),
         )
-
-    def describe(self) -> AxisIdentity:
-        return self._identity
 
     def _status(self) -> ShotStatus:
         *pulses, taken, at_limit, busy = self._line.ask("Q:", _STATUS).replace(" ", "").split(",")

@@ -18,7 +18,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from drivers.errors import CommandRejected, WrongDevice
-from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.motion import AxisConfig, MotionAxis
 from drivers.prompt_line import PromptLine, prompt_framer
 from drivers.serial_link import LineRegistry, SerialLink
 
@@ -69,17 +69,12 @@ class LCC25Axis(MotionAxis):
         self.speed_deg_s = self.acceleration_deg_s2 = math.inf
         self._device_min_deg, self._device_max_deg = 0.0, HIGHEST_V
         self._rests_from_s = -math.inf
-        self._identity = AxisIdentity(
-            kind=config.kind,
+        self._identify(
             model=identity,
             serial_number="not told by the protocol",
             firmware="not told by the protocol",
-            port=config.port,
             address="voltage 1",
         )
-
-    def describe(self) -> AxisIdentity:
-        return self._identity
 
     def move_time_s(self, distance_deg: float) -> float:
         """Time that the crystal takes, whatever the change."""

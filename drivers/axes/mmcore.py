@@ -13,7 +13,6 @@ from pydantic import Field
 
 from drivers.errors import PortNotFound, WrongDevice
 from drivers.micromanager import NOT_TOLD, asking, loaded_devices, running_core
-from drivers.motion import AxisIdentity
 from drivers.serial_link import LineRegistry
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
 
@@ -53,17 +52,12 @@ class MMCoreAxis(SessionReferenceAxis):
         self.counts_per_deg = config.units_per_deg
         self.speed_deg_s, self.acceleration_deg_s2 = config.speed_deg_s, config.acceleration_deg_s2
         with asking(asked):
-            self._identity = AxisIdentity(
-                kind=config.kind,
+            self._identify(
                 model=f"{core.getDeviceLibrary(config.device)} {core.getDeviceName(config.device)}",
                 serial_number=NOT_TOLD,
                 firmware=core.getVersionInfo(),
-                port=config.port,
                 address=config.device,
             )
-
-    def describe(self) -> AxisIdentity:
-        return self._identity
 
     def _do_read_counts(self) -> float:
         with asking(f"axis {self.name}, read position"):

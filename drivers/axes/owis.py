@@ -16,7 +16,6 @@ from pydantic import Field
 
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, WrongDevice
-from drivers.motion import AxisIdentity
 from drivers.serial_link import LineRegistry, Transcript, agreed, line_framer
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
 from drivers.text_line import TextLine
@@ -75,17 +74,9 @@ class OWISAxis(SessionReferenceAxis):
             raise WrongDevice(asked, f"the unit has {count} axes", "Correct `axis` in the rig file")
         self.counts_per_deg = config.counts_per_deg
         self.speed_deg_s, self.acceleration_deg_s2 = config.speed_deg_s, config.acceleration_deg_s2
-        self._identity = AxisIdentity(
-            kind=config.kind,
-            model=f"OWIS PS of {count} axes",
-            serial_number="not asked for",
-            firmware=version,
-            port=config.port,
-            address=str(config.axis),
+        self._identify(
+            model=f"OWIS PS of {count} axes", serial_number="not asked for", firmware=version, address=str(config.axis)
         )
-
-    def describe(self) -> AxisIdentity:
-        return self._identity
 
     def _state(self) -> str:
         for _ in range(2):

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, DeviceError, NotHomedError, ReplyError, ReplyTimeout, WrongDevice
-from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.motion import AxisConfig, MotionAxis
 from drivers.serial_link import ControllerLine, LineRegistry, Transcript, agreed, line_framer
 from drivers.unmarked_replies import ask
 
@@ -156,17 +156,12 @@ class SMC100Axis(MotionAxis):
         self._device_max_deg = self._constant("SR?")
         model, _, firmware = version.rpartition(" ")
         self._model_is_known = any(known in version.upper() for known in _KNOWN)
-        self._identity = AxisIdentity(
-            kind=config.kind,
+        self._identify(
             model=f"{model or version} stage {stage or 'not told'}",
             serial_number="not told by the protocol",
             firmware=firmware,
-            port=config.port,
             address=str(config.address),
         )
-
-    def describe(self) -> AxisIdentity:
-        return self._identity
 
     def _ask(self, command: str, value: re.Pattern[str], reply_s: float | None = None) -> str:
         return self._line.ask(self.config.address, command, value, reply_s)

@@ -17,7 +17,6 @@ from pydantic import Field
 
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
-from drivers.motion import AxisIdentity
 from drivers.serial_link import ControllerLine, LineRegistry, Transcript
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
 from drivers.standa_frames import ERRORS, LAYOUTS, RESYNCHRONIZE, WRONG_VALUE, framer, message
@@ -164,12 +163,10 @@ class StandaAxis(SessionReferenceAxis):
                 f"{asked}, speed", "speed, acceleration or homing speed is zero", "Load the stage's profile"
             )
         self._read_borders()
-        self._identity = AxisIdentity(
-            kind=config.kind,
+        self._identify(
             model=f"{product.rstrip(bytes(1)).decode('ascii', 'replace')} {'.'.join(map(str, hardware))}",
             serial_number=str(serial_number),
             firmware=".".join(map(str, line.ask(b"gfwv"))),
-            port=config.port,
             address="",
         )
 
@@ -179,9 +176,6 @@ class StandaAxis(SessionReferenceAxis):
             self._device_min_deg = (left + micro_left / self._microsteps) / self.config.steps_per_deg
         if flags & BORDER_IS_A_COUNT and flags & BORDER_STOPS_RIGHT:
             self._device_max_deg = (right + micro_right / self._microsteps) / self.config.steps_per_deg
-
-    def describe(self) -> AxisIdentity:
-        return self._identity
 
     def _status(self) -> Status:
         values = self._line.ask(b"gets")

@@ -19,7 +19,7 @@ from pydantic import Field
 from drivers.axis_types import stage_limit
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, LimitError, NotHomedError, ReplyError, ReplyTimeout, WrongDevice
-from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.motion import AxisConfig, MotionAxis
 from drivers.serial_link import ControllerLine, LineRegistry, SerialLink, Transcript, agreed
 from drivers.unmarked_replies import ask, text_of
 
@@ -136,12 +136,10 @@ class XPSAxis(MotionAxis):
             raise ReplyError(f"axis {name}, speed", f"{speed[:2]}", "Set the parameters of the stage")
         limits = agreed(lambda: self._ask("PositionerUserTravelLimitsGet", 2))
         self._device_min_deg, self._device_max_deg = map(stage_limit, limits)
-        self._identity = AxisIdentity(
-            kind=config.kind,
+        self._identify(
             model=firmware.partition(" ")[0],
             serial_number="not told by the protocol",
             firmware=firmware,
-            port=config.port,
             address=positioner,
         )
 
@@ -152,9 +150,6 @@ class XPSAxis(MotionAxis):
             raise WrongDevice(
                 f"{asked}, group {self.config.group}", error.came_back, "Correct `group` in the rig file"
             ) from error
-
-    def describe(self) -> AxisIdentity:
-        return self._identity
 
     def _ask(self, function: str, values: int) -> tuple[float, ...]:
         wanted = ",".join(["double *"] * values)

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
-from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.motion import AxisConfig, MotionAxis
 from drivers.serial_link import ControllerLine, LineRegistry, Transcript, agreed, line_framer
 
 VELOCITY_UNIT = 1.6384  # native velocity per microstep/s (unverified)
@@ -224,12 +224,10 @@ class ZaberAxis(MotionAxis):
             )
         self._device_min_deg = self._limit("limit.min")
         self._device_max_deg = self._limit("limit.max")
-        self._identity = AxisIdentity(
-            kind=config.kind,
+        self._identify(
             model=f"device id {self._ask('get deviceid', axis=0).data}",
             serial_number=serial_number,
             firmware=self._ask("get version", axis=0).data,
-            port=config.port,
             address=str(self._address),
         )
 
@@ -256,9 +254,6 @@ class ZaberAxis(MotionAxis):
             what = f"no device has {rule}" if rule else f"{len(wanted)} devices answer and the rig file names none"
             raise WrongDevice(asked, f"{what}; found {listed}", "Correct the rig file or the wiring")
         return wanted[0]
-
-    def describe(self) -> AxisIdentity:
-        return self._identity
 
     def _ask(self, words: str, *, axis: int | None = None, repeat: bool = True) -> Reply:
         return self._line.ask(self._address, self.config.axis if axis is None else axis, words, repeat=repeat)
