@@ -1,1 +1,1 @@
-"""The commands of `process`, one module for each group; each has `register(app)` and imports its work late."""
+"""The commands of `process`: a module for each group marks its functions `@command` and imports its work late."""

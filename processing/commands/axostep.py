@@ -6,16 +6,12 @@ from typing import Annotated
 import typer
 
 from processing.commands.batch import Made, files_of, place_for, run_batch, written_if_changed
+from processing.commands.command_line import command
 from processing.commands.product_options import Overwrite, ProductFile
 from processing.commands.purposes import DATA, EXPORT
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("from-axostep", rich_help_panel=DATA)(from_axostep_command)
-    app.command("to-axostep", rich_help_panel=EXPORT)(to_axostep_command)
-
-
+@command("from-axostep", DATA)
 def from_axostep_command(
     *,
     sources: Annotated[
@@ -46,6 +42,7 @@ def from_axostep_command(
     run_batch("reading", "files", inputs, make, print_result=print_result)
 
 
+@command("to-axostep", EXPORT)
 def to_axostep_command(
     sources: Annotated[list[Path], typer.Argument(help="Mueller products of `process reduce`, or folders of them.")],
     out: Annotated[

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from processing.commands.command_line import command
 from processing.commands.product_options import Overwrite, ProductFile
 from processing.commands.purposes import CALIBRATION
 
@@ -14,12 +15,7 @@ if TYPE_CHECKING:
     from processing.calibration.train import CurveFit, FittedValues
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("calibrate", rich_help_panel=CALIBRATION)(calibrate_command)
-    app.command("calibrate-mosaic", rich_help_panel=CALIBRATION)(calibrate_mosaic_command)
-
-
+@command("calibrate", CALIBRATION)
 def calibrate_command(
     *,
     captures: Annotated[
@@ -91,6 +87,7 @@ def calibrate_command(
         typer.echo(str(write))
 
 
+@command("calibrate-mosaic", CALIBRATION)
 def calibrate_mosaic_command(
     capture: Annotated[Path, typer.Argument(help="Mosaic capture of an even field behind a turning polarizer.")],
     instrument: Annotated[Path | None, typer.Option(help="Instrument file; default: the one in the capture.")] = None,

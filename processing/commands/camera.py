@@ -5,16 +5,13 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.command_line import command
 from processing.commands.drawing import FigureFile, NoFigure, draw
 from processing.commands.product_options import Overwrite
 from processing.commands.purposes import CALIBRATION
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("camera", rich_help_panel=CALIBRATION)(camera_command)
-
-
+@command("camera", CALIBRATION)
 def camera_command(
     *,
     captures: Annotated[list[Path], typer.Argument(help="Captures with dark states and with repeated states.")],

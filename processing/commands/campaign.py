@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from processing.commands.batch import reason_of
+from processing.commands.command_line import command
 from processing.commands.purposes import REPORTS
 from processing.whole_file import whole_file
 
@@ -17,11 +18,7 @@ if TYPE_CHECKING:
     from processing.campaign.run import CampaignResult
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("campaign", rich_help_panel=REPORTS)(campaign_command)
-
-
+@command("campaign", REPORTS)
 def campaign_command(
     *,
     folder: Annotated[Path, typer.Argument(help="Folder of captures: any samples, angles and instruments.")],

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from processing.commands.batch import Made, files_of, run_batch
+from processing.commands.command_line import command
 from processing.commands.purposes import CALIBRATION
 
 if TYPE_CHECKING:
@@ -15,11 +16,7 @@ if TYPE_CHECKING:
     from processing.steps.file_step import Progress
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("check", rich_help_panel=CALIBRATION)(check_command)
-
-
+@command("check", CALIBRATION)
 def check_command(
     captures: Annotated[
         list[Path], typer.Argument(help="Captures of air or of another sample that is kept, or folders of them.")

@@ -4,10 +4,10 @@ import atexit
 import gc
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from importlib.metadata import version
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, TypeVar
 
 import typer
 from typer.core import TyperGroup
@@ -39,6 +39,21 @@ def _tell_version(wanted: bool) -> None:
 Version = Annotated[
     bool, typer.Option("--version", help="print the version and stop", callback=_tell_version, is_eager=True)
 ]
+
+
+#: What `command` has marked: name, heading of the help, function.
+COLLECTED: list[tuple[str, str, Callable[..., None]]] = []
+F = TypeVar("F", bound=Callable[..., None])
+
+
+def command(name: str, purpose: str) -> Callable[[F], F]:
+    """Make a command of `process` of a function, under a heading of its help (`processing.commands.purposes`)."""
+
+    def keep(function: F) -> F:
+        COLLECTED.append((name, purpose, function))
+        return function
+
+    return keep
 
 
 class Commands(TyperGroup):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from processing.commands.command_line import command
 from processing.commands.purposes import CALIBRATION
 from processing.whole_file import write_new_text
 
@@ -16,11 +17,7 @@ if TYPE_CHECKING:
     from processing.instrument.states import StateTable
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("design", rich_help_panel=CALIBRATION)(design_command)
-
-
+@command("design", CALIBRATION)
 def design_command(
     *,
     instrument: Annotated[Path | None, typer.Argument(help="Instrument file of a Mueller polarimeter.")] = None,

@@ -6,14 +6,11 @@ from typing import Annotated
 import typer
 
 from processing.commands.batch import Made, files_of, place_for, run_batch, written_if_changed
+from processing.commands.command_line import command
 from processing.commands.purposes import EXPORT
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("export", rich_help_panel=EXPORT)(export_command)
-
-
+@command("export", EXPORT)
 def export_command(
     *,
     sources: Annotated[

@@ -5,16 +5,12 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.command_line import command
 from processing.commands.purposes import CALIBRATION
 from processing.whole_file import write_whole_text
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("camera-pose", rich_help_panel=CALIBRATION)(camera_pose_command)
-    app.command("register", rich_help_panel=CALIBRATION)(register_command)
-
-
+@command("camera-pose", CALIBRATION)
 def camera_pose_command(
     *,
     images: Annotated[list[Path], typer.Argument(help="Images of a ChArUco board, tilted this way and that.")],
@@ -52,6 +48,7 @@ def camera_pose_command(
     typer.echo(str(out))
 
 
+@command("register", CALIBRATION)
 def register_command(
     source: Annotated[Path, typer.Argument(help="Product of `process reduce` that shows the object.")],
     geometry: Annotated[Path, typer.Option(help="Geometry file to start from.")],

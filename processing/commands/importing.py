@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from processing.commands.batch import Made, files_of, place_for, run_batch
+from processing.commands.command_line import command
 from processing.commands.purposes import DATA
 from processing.commands.recipe import read_recipe, recipe_text
 from processing.errors import ProcessError
@@ -26,12 +27,7 @@ class AngleUnit(StrEnum):
     radians = "radians"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("import", rich_help_panel=DATA)(import_command)
-    app.command("colours", rich_help_panel=DATA)(colours_command)
-
-
+@command("import", DATA)
 def import_command(
     *,
     context: typer.Context,
@@ -184,6 +180,7 @@ def _name_and_column(text: str) -> tuple[str, str]:
     return name.strip(), column.strip()
 
 
+@command("colours", DATA)
 def colours_command(
     captures: Annotated[
         list[Path], typer.Argument(help="Captures of a sensor with a colour filter, or folders of them.")

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.command_line import command
 from processing.commands.purposes import DATA
 
 _GENERATORS = {
@@ -33,11 +34,7 @@ mosaic: [["90", "45"], ["135", "0"]]
 """
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("init", rich_help_panel=DATA)(init_command)
-
-
+@command("init", DATA)
 def init_command(
     what: Annotated[str, typer.Argument(help="What to describe: instrument.")] = "instrument",
     out: Annotated[Path, typer.Option(help="New instrument file (YAML).")] = Path("my_polarimeter.yaml"),

@@ -9,17 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from processing.commands.batch import captures_and, files_of
+from processing.commands.command_line import command
 from processing.commands.purposes import IMAGES
 
 if TYPE_CHECKING:
     from processing.maps.means import MeanValue
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("mean", rich_help_panel=IMAGES)(mean_command)
-
-
+@command("mean", IMAGES)
 def mean_command(
     *,
     sources: Annotated[list[Path], typer.Argument(help="Captures or products of one sample, or folders of them.")],

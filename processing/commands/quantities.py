@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from processing.commands.batch import captures_and, files_of, make_products
+from processing.commands.command_line import command
 from processing.commands.drawing import FigureFile, NoFigure
 from processing.commands.product_options import Overwrite, ProductFile
 from processing.commands.purposes import IMAGES
@@ -17,11 +18,7 @@ if TYPE_CHECKING:
     from processing.steps.file_step import FileStep, Found, Progress
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("quantities", rich_help_panel=IMAGES)(quantities_command)
-
-
+@command("quantities", IMAGES)
 def quantities_command(
     *,
     sources: Annotated[

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from processing.commands.batch import files_of, make_products
+from processing.commands.command_line import command
 from processing.commands.drawing import FigureFile, NoFigure
 from processing.commands.product_options import Overwrite, ProductFile
 from processing.commands.purposes import IMAGES
@@ -16,11 +17,7 @@ if TYPE_CHECKING:
     from processing.steps.file_step import FileStep, Progress
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("reduce", rich_help_panel=IMAGES)(reduce_command)
-
-
+@command("reduce", IMAGES)
 def reduce_command(
     *,
     captures: Annotated[list[Path], typer.Argument(help="Captures (HDF5), or folders of them.")],

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from processing.commands.batch import captures_and, files_of, make_products
+from processing.commands.command_line import command
 from processing.commands.drawing import FigureFile, NoFigure
 from processing.commands.product_options import Overwrite, ProductFile
 from processing.commands.purposes import REFLECTANCE
@@ -16,12 +17,6 @@ from processing.whole_file import whole_file
 if TYPE_CHECKING:
     from processing.calibration.illumination_design import Assumptions
     from processing.steps.file_step import FileStep, Found, Progress
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("fit-material", rich_help_panel=REFLECTANCE)(fit_material_command)
-    app.command("extrapolate", rich_help_panel=REFLECTANCE)(extrapolate_command)
 
 
 def design_stokes(geometry: Path, material: Path, camera: Path, given: Assumptions, *, figure: Path) -> None:
@@ -51,6 +46,7 @@ def design_stokes(geometry: Path, material: Path, camera: Path, given: Assumptio
     typer.echo(str(figure))
 
 
+@command("fit-material", REFLECTANCE)
 def fit_material_command(
     *,
     sources: Annotated[list[Path], typer.Argument(help="Products of `process reduce`, one kind, one wavelength.")],
@@ -89,6 +85,7 @@ def fit_material_command(
     typer.echo(str(out))
 
 
+@command("extrapolate", REFLECTANCE)
 def extrapolate_command(
     *,
     sources: Annotated[

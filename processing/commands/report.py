@@ -5,14 +5,11 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.command_line import command
 from processing.commands.purposes import REPORTS
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("report", rich_help_panel=REPORTS)(report_command)
-
-
+@command("report", REPORTS)
 def report_command(
     sources: Annotated[list[Path], typer.Argument(help="Captures, products, CSV, pictures, or folders of them.")],
     out: Annotated[Path, typer.Option(help="HTML file to write.")] = Path("report.html"),

@@ -5,14 +5,11 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.command_line import command
 from processing.commands.purposes import REPORTS
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("show", rich_help_panel=REPORTS)(show_command)
-
-
+@command("show", REPORTS)
 def show_command(
     instrument: Annotated[Path, typer.Argument(help="Instrument file, as `diagnose --write` makes it.")],
     wavelength_nm: Annotated[

@@ -5,18 +5,12 @@ from typing import Annotated, Literal
 
 import typer
 
+from processing.commands.command_line import command
 from processing.commands.purposes import DATA, EXPORT, REFLECTANCE
 from processing.whole_file import whole_file
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("table", rich_help_panel=REFLECTANCE)(table_command)
-    app.command("compare-tables", rich_help_panel=REFLECTANCE)(compare_command)
-    app.command("export-pbsdf", rich_help_panel=EXPORT)(export_command)
-    app.command("import-pbsdf", rich_help_panel=DATA)(import_command)
-
-
+@command("table", REFLECTANCE)
 def table_command(
     *,
     sources: Annotated[list[Path], typer.Argument(help="Mueller or xi0 products of one wavelength.")],
@@ -61,6 +55,7 @@ def table_command(
     typer.echo(str(out))
 
 
+@command("compare-tables", REFLECTANCE)
 def compare_command(
     *,
     reference: Annotated[Path, typer.Argument(help="Table of xi0 (`process table`, or of a campaign).")],
@@ -110,6 +105,7 @@ def compare_command(
     typer.echo(str(figure))
 
 
+@command("export-pbsdf", EXPORT)
 def export_command(
     *,
     tables: Annotated[
@@ -145,6 +141,7 @@ def export_command(
     typer.echo(str(out))
 
 
+@command("import-pbsdf", DATA)
 def import_command(
     source: Annotated[Path, typer.Argument(help="Renderer file (.pbsdf).")],
     wavelength_nm: Annotated[float, typer.Option(help="Which of its wavelengths.")],

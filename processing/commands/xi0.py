@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from processing.commands.batch import captures_and, files_of, make_products
+from processing.commands.command_line import command
 from processing.commands.drawing import FigureFile, NoFigure
 from processing.commands.product_options import Overwrite, ProductFile
 from processing.commands.purposes import IMAGES
@@ -16,11 +17,7 @@ if TYPE_CHECKING:
     from processing.steps.file_step import FileStep, Found, Progress
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("xi0", rich_help_panel=IMAGES)(xi0_command)
-
-
+@command("xi0", IMAGES)
 def xi0_command(
     *,
     sources: Annotated[
