@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from noisy_images import nineteen_samples, noisy_image, seven_instruments
 
-from processing.maps.intervals import ANGLES_OF
+from processing.maps.intervals import ANGLES_OF, whole_range
 from processing.maps.quantities import EXTRA, quantities_block
 from processing.maps.xi0 import eigenvalue_block
 from processing.polarization.magnitude import NORMAL_95
@@ -33,6 +33,8 @@ FIXED = 1e-9
 ROUNDING = 1e-6
 #: A vector shorter than so many errors at `BRIGHT` has no direction.
 UNDEFINED_LENGTH = 30
+#: More than this covers too often; pixels of a cell fewer than this part do not tell.
+MOST_95, FEW = 0.97, 0.05
 #: A quantity whose error at `BRIGHT` is larger than this does not exist.
 UNDEFINED = 0.01
 
@@ -46,6 +48,8 @@ class Cell:
     has_interval : part of the pixels that have one.
     in_68, in_95 : part of the truths within the intervals; a pixel without one does not cover.
     rms, mean : of the pulls.
+    everything : part of the pixels whose 95 % interval is all that the quantity can be.
+    in_95_others : part of the truths within the 95 % intervals of all other pixels; NaN where there is none.
     """
 
     quantity: str
@@ -58,6 +62,8 @@ class Cell:
     in_95: float
     rms: float
     mean: float
+    everything: float
+    in_95_others: float
 
 
 def cells(
@@ -131,6 +137,8 @@ def cells_of(
             # Where there is no value the interval is everything.
             unknown = (~np.isfinite(value) & (low <= true + tolerance) & (true - tolerance <= high))[exists]
             inside_68, inside_95 = inside_68 | unknown, inside_95 | unknown
+            least, most = whole_range(name, value)
+            everything = ((low <= least + ROUNDING) & (high >= most - ROUNDING))[exists]
             yield Cell(
                 name,
                 name_of_w,
@@ -142,6 +150,8 @@ def cells_of(
                 float(inside_95.mean()),
                 float(np.sqrt(np.mean(pull**2))) if pull.size else np.nan,
                 float(np.mean(pull)) if pull.size else np.nan,
+                float(everything.mean()),
+                float(inside_95[~everything].mean()) if not everything.all() else np.nan,
             )
 
 
@@ -174,6 +184,23 @@ def table(found: Sequence[Cell]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def table_of_everything(found: Sequence[Cell]) -> str:
+    """Markdown: of cells whose 95 % intervals cover above 97 %, how many do so as their data do not say more."""
+    lines = ["| quantity | electrons | above 97 % | by whole ranges | whole ranges | others |", 6 * "|---" + "|"]
+    for name in dict.fromkeys(c.quantity for c in found):
+        for electrons in dict.fromkeys(c.electrons for c in found):
+            some = [c for c in found if c.quantity == name and c.electrons == electrons]
+            above = [c for c in some if c.in_95 > MOST_95]
+            # The others cover no more than they claim, or are too few to tell.
+            by_range = [c for c in above if not c.in_95_others > MOST_95 or c.everything > 1 - FEW]
+            weights = np.array([1 - c.everything for c in some])
+            others = np.array([c.in_95_others for c in some])[weights > 0] @ weights[weights > 0]
+            share = 100 * np.mean([c.everything for c in some]) if some else 0
+            covered = f"{100 * others / weights.sum():.1f}" if weights.sum() > 0 else "-"
+            lines.append(f"| {name} | {electrons:g} | {len(above)} | {len(by_range)} | {share:.0f} | {covered} |")
+    return "\n".join(lines) + "\n"
+
+
 def holds(cell: Cell) -> bool:
     """Whether a cell is within the limits: 64 to 72 %, 93 to 97 %, pulls of 0.9 to 1.1."""
     return 0.64 <= cell.in_68 <= 0.72 and 0.93 <= cell.in_95 <= 0.97 and 0.9 <= cell.rms <= 1.1
@@ -200,3 +227,4 @@ if __name__ == "__main__":
             writer.writeheader()
             writer.writerows(asdict(cell) for cell in every)
     print(table(every))
+    print(table_of_everything(every))

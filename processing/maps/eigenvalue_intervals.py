@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from processing.arrays import Array
+from processing.arrays import Array, RealArray
 from processing.maps.intervals import SEEN, Planes, put
 from processing.polarization.eigenvalue_noise import CorrectedXi0, EigenvalueNoise
 from processing.polarization.magnitude import NORMAL_95, interval, positive
 from processing.polarization.quantities import entropy
 from processing.polarization.sorted_eigenvalues import of_gaps
+from processing.storage.products.images import MuellerImage
 
 #: Equal eigenvalues are seen apart by the noise between them times the root of this, on average.
 _REPELLED = 4.0
 #: Parts of the light not in the dominant process between which entropy passes from that of a nearly pure sample to that
-#: of a depolarizer, and errors of the depolarization index from which on its own bend is seen.
-PURE, FLAT = (0.15, 0.45), 5.0
+#: of a depolarizer.
+PURE = (0.15, 0.45)
 #: Largest singular value of 3 x 3 noise of variance 1: 68 % of them are smaller.
 OF_NOISE = 2.8
 
@@ -73,55 +74,56 @@ def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0,
     return shrunk
 
 
-def set_entropy(planes: Planes, xi: Array, found: CorrectedXi0) -> None:
-    """Entropy of eigenvalues (4, ...) whose deviations have lost what noise adds. `set_magnitudes` is done.
+def set_entropy(planes: Planes, xi: Array, slopes: RealArray, image: MuellerImage) -> None:
+    """Entropy of eigenvalues (4, ...) whose deviations have lost what noise adds. All others are done.
 
-    It is bent where an eigenvalue may be zero, and where all may be equal. There it follows what is known: of a nearly
-    pure sample xi0, the others in proportion; of a depolarizer the depolarization index, all eigenvalues in proportion.
+    It follows the depolarization index, which has an interval where entropy is bent: near 0 and 1. What noise does at
+    one index is added in squares, to first order, with each eigenvalue as large as its error at least.
+
+    Parameters
+    ----------
+    slopes : (4, ..., 16), gradients of the eigenvalues.
     """
-    own = entropy_of(xi)
-    spread = planes["entropy_errors"].astype(float)
-    errors = np.concatenate([found.stderr[None], planes["coherency_eigenvalues_errors"][1:]])
-    index, u = planes["depolarization_index"].astype(float), planes["depolarization_index_errors"].astype(float)
-    bent = (xi < SEEN * errors).any(axis=0) | (index < FLAT * u) | ~np.isfinite(spread)
-    rest, off = np.clip(xi[1:], 0, None), xi - 0.25
+    index, error = (planes[f"depolarization_index{end}"].astype(float) for end in ("", "_errors"))
+    bounds = planes["depolarization_index_95"].astype(float)
+    off = xi - 0.25
+    pattern = off / np.sqrt(4 / 3 * np.square(off).sum(axis=0))
+    rest = np.clip(xi[1:], 0, None)
     sums = rest.sum(axis=0)
     rest = np.where(sums > 0, rest / np.where(sums > 0, sums, 1), 1 / 3)
-    scale = np.sqrt(4 / 3 * np.square(off).sum(axis=0))
-    share = np.clip((1 - found.xi0 - PURE[0]) / (PURE[1] - PURE[0]), 0, 1)
-    both = (found.interval_68, np.stack([index - u, index + u])), (found.interval_95, planes["depolarization_index_95"])
-    middle, half = planes["td_missed"].astype(float), planes["td_missed_errors"].astype(float)
-    missed = np.stack([np.maximum(middle - half, 0), middle + half]), planes["td_missed_95"]
-    ends = []
-    for (of_xi0, of_index), deviate, level in zip(both, (1.0, NORMAL_95), (0, 1), strict=True):
-        unit = (of_xi0[1] - of_xi0[0]) / (2 * deviate)
-        observed = (1 - found.xi0) / unit
-        lost = np.where(observed < 4, positive(observed)[level] * unit, 1 - of_xi0[::-1])
-        pure = _of_pure(lost, 1 - found.xi0, rest, missed[level] / np.where(middle > 0, middle, 1))
-        even = [entropy_of(0.25 + off * (np.maximum(x, 0) / scale)) for x in of_index[::-1]]
-        far = [(1 - share) * p + share * e for p, e in zip(pure, even, strict=True)]
-        near = [own - deviate * spread, own + deviate * spread]
-        if level:
-            # Beyond first order entropy depends on both.
-            near = [np.fmin(near[0], far[0]), np.fmax(near[1], far[1])]
-        ends += [np.where(bent, f, n) for f, n in zip(far, near, strict=True)]
-    low, high, low_95, high_95 = ends
-    put(planes, "entropy", (low + high) / 2, (high - low) / 2, np.maximum(low_95, 0), np.minimum(high_95, 1))
+    even = 1 + np.square(rest).sum(axis=0)
 
+    def at(of_index: Array) -> Array:
+        # Of the light that is not in the dominant process, of a nearly pure sample, the shares stay.
+        lost = 0.75 * (1 - np.square(np.clip(of_index, 0, 1)))
+        lost = (1 - np.sqrt(np.maximum(1 - even * lost, 0))) / even
+        pure = entropy_of(np.concatenate([1 - lost[None], lost * rest]))
+        share = np.clip((lost - PURE[0]) / (PURE[1] - PURE[0]), 0, 1)
+        return np.asarray(pure + share * (entropy_of(0.25 + pattern * np.maximum(of_index, 0)) - pure))
 
-def _of_pure(lost: Array, middle: Array, rest: Array, apart: Array) -> list[Array]:
-    """Ends of the entropy by those (2, ...) of what xi0 leaves, and of how far the others `rest` (3, ...) are apart."""
-
-    def at(p: Array, spread: Array | float) -> Array:
-        light = np.clip(p, 0, 0.75)
-        shares = np.clip(1 / 3 + spread * (rest - 1 / 3), 0, None)
-        return entropy_of(np.concatenate([1 - light[None], light * shares / shares.sum(axis=0)]))
-
-    own = at(middle, 1.0)
-    return [
-        own + side * np.hypot(at(p, 1.0) - own, at(middle, spread) - own)
-        for p, spread, side in zip(lost, apart[::-1], (-1, 1), strict=True)
-    ]
+    by_eigenvalue = -np.log(np.maximum(xi, planes["coherency_eigenvalues_errors"])) / np.log(4)
+    total = image.variance_of(np.einsum("k...,k...i->...i", by_eigenvalue, slopes))
+    middle, ends = at(index), []
+    by_index = np.fmax(*(np.abs(at(index + side * error) - middle) for side in (-1, 1)))
+    apart = np.sqrt(np.maximum(total - np.square(by_index), 0))
+    for level, (deviate, of_index) in enumerate(((1.0, np.stack([index - error, index + error])), (NORMAL_95, bounds))):
+        for side, far in ((-1, of_index[1]), (1, of_index[0])):
+            unit = np.abs(bounds[(1 - side) // 2] - index) / NORMAL_95
+            off_pure = (1 - index) / unit
+            nearest = np.where(off_pure < 4, 1 - positive(off_pure)[level][(1 + side) // 2] * unit, far)
+            end = at(np.fmin(nearest, far) if side > 0 else nearest)
+            ends.append(np.clip(middle + side * np.hypot(end - middle, deviate * apart), 0, 1))
+    low, high, *ends = ends
+    # Next to an end of its range the estimate is not the middle of the interval: a truth there has no pull of 1.
+    value = np.where((low > 0) & (high < 1), (low + high) / 2, middle)
+    known = ((bounds[0] > 0) | (bounds[1] != 1)) & np.isfinite(value + ends[0] + ends[1])
+    error = np.where(known, np.maximum(high - value, value - low), np.fmax(np.fmax(value, 1 - value), 1 / 2))
+    without = np.isnan(image.errors[0, 0])
+    error, *ends = (
+        np.where(without, np.nan, np.where(known, own, end))
+        for own, end in zip((error, *ends), (error, 0.0, 1.0), strict=True)
+    )
+    put(planes, "entropy", value, error, *ends)
 
 
 def entropy_of(xi: Array) -> Array:

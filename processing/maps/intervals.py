@@ -170,7 +170,7 @@ def set_ratios(planes: Planes, derived: Mapping[str, Derived], image: ElementNoi
             planes[f"{name}_95"] = np.stack([value - NORMAL_95 * error, value + NORMAL_95 * error])
         lost = measured & ~np.isfinite(value)
         if lost.any():
-            low, high = _range(name, value)
+            low, high = whole_range(name, value)
             np.copyto(error, high - low, where=lost)
             if has_own_95(name):
                 np.copyto(planes[f"{name}_95"], np.stack([low, high]), where=lost)
@@ -181,7 +181,7 @@ def set_ratios(planes: Planes, derived: Mapping[str, Derived], image: ElementNoi
         if name.endswith("_deg"):
             # No ratio to m00.
             bent, shared = np.zeros_like(u), np.zeros_like(shared)
-        low, high = _range(name, own)
+        low, high = whole_range(name, own)
         half = np.max(np.abs(over_m00(np.stack([-error[..., some], error[..., some]]), bent, shared, 1.0)), axis=0)
         everything = np.where(np.isfinite(own), np.maximum(own - low, high - own), high - low)
         error[..., some] = np.where(u < 1 / SEEN, half, everything)
@@ -207,7 +207,7 @@ def over_m00(sides: Array, u: Array, shared: Array, deviate: float) -> Array:
         return np.asarray((np.sign(sides) * np.sqrt(turn**2 + sides**2 * known) - turn) / known)
 
 
-def _range(name: str, value: Array) -> tuple[Array, Array]:
+def whole_range(name: str, value: Array) -> tuple[Array, Array]:
     """What a quantity can be, (...) each; of an angle all of its period about the value."""
     if name in ANGLES:
         half = 45.0 if name == EITHER_AXIS else 90.0

@@ -270,7 +270,6 @@ def _set_intervals(
     set_magnitudes(found, derived, m, image, widened=factor, known={"retardance_deg": retardance})
     if isinstance(image, MuellerImage):
         set_any_dominant(found, derived, np.isfinite(factor))
-        set_entropy(found, shrunk, xi0)
     weakest = np.abs(_symmetric_eigenvalues(np.nan_to_num(depolarizer[..., 1:, 1:]))).min(axis=0)
     # What is left of the light after the diattenuator carries the noise of all of it.
     passed = 1 - np.square(np.asarray(derived["diattenuation"].value) + diattenuation_error)
@@ -283,6 +282,8 @@ def _set_intervals(
     if "symmetric_d1" in found:
         set_symmetric(found, uneven * _relative_error(image))
     set_ratios(found, derived, image, m[..., 0, 0])
+    if isinstance(image, MuellerImage):
+        set_entropy(found, shrunk, derived["coherency_eigenvalues"].gradient, image)
 
 
 def _is_principal(found: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
