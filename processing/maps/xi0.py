@@ -14,7 +14,7 @@ from scipy import ndimage
 from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
 from processing.maps.coherency_noise import coherency_noise
-from processing.maps.intervals import SEEN, UNEVEN, moves_of, over_m00, widened
+from processing.maps.intervals import LEAST_M00, UNEVEN, moves_of, over_m00, widened
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
 from processing.polarization.eigenvalue_noise import EigenvalueNoise, corrected
 from processing.polarization.xi0 import Xi0Estimate, estimate
@@ -116,7 +116,7 @@ def eigenvalue_block(image: MuellerImage) -> dict[str, NDArray[Any]]:
     for name, ends, deviate in (("xi0_68", found.interval_68, 1.0), ("xi0_95", found.interval_95, NORMAL_95)):
         wide = found.xi0 + over_m00(ends - found.xi0, noise.m00, shared, deviate)
         wide = np.where(noise.m00 > UNEVEN, wide, ends)
-        unknown = (noise.m00 > 1 / SEEN) | (image.values[0, 0] <= 0)
+        unknown = (noise.m00 > 1 / LEAST_M00) | (image.values[0, 0] <= 0)
         intervals[name] = np.where(unknown, np.array([0.25, 1.0])[:, None, None], wide)
     known = np.isfinite(found.xi0)
     # Without standard errors nothing can be taken off.
