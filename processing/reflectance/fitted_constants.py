@@ -205,8 +205,9 @@ def result_of(
     # What n does to light is in proportion to n - 1, and so is its error.
     effect = np.abs(found - np.eye(len(found))[0])
     limit = np.maximum(RELATIVE_LIMIT * effect, of.small)
-    # k and a may well be 0; an n at the end of its range is no surface, and what was fitted beside it means nothing.
-    identified = {name: bool(s <= m and inside[0]) for name, s, m in zip(of.names, stderr, limit, strict=True)}
+    # k and a may well be 0. An n at the end of its range is no surface, and errors to first order hold about one n.
+    fixed = (stderr <= limit) & inside[0] & (stderr[0] <= limit[0])
+    identified = dict(zip(of.names, fixed.tolist(), strict=True))
     return MaterialFit(
         kind=of.kind,
         names=of.names,

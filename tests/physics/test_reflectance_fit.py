@@ -185,6 +185,16 @@ def test_what_the_data_do_not_fix_is_said(sphere):
         fit_matrices(geometry, np.full((len(m), 4, 4), np.nan))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_fitted_beside_an_n_that_is_not_fixed_is_not_identified(sphere, seed):
+    """Its error to first order is about an n that may be another: of 55 images b was inside in 86 %, 4 errors off."""
+    geometry, m = sphere[0][380:760], sphere[1][380:760]
+    p, variance = noisy(m / m[:, 0, 0].mean(), stokes(VERTICAL), seed, 12_000)
+    fit = fit_intensities(geometry, p, stokes(VERTICAL), variance)
+    assert fit.stderr[3] < 0.3 * fit.constants[3]
+    assert not any(fit.identified.values())
+
+
 def test_a_turned_geometry_lowers_the_correlation(sphere):
     geometry, m = sphere
     w = stokes(VERTICAL)
