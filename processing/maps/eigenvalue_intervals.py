@@ -97,33 +97,31 @@ def set_entropy(planes: Planes, xi: Array, slopes: RealArray, image: MuellerImag
         # Of the light that is not in the dominant process, of a nearly pure sample, the shares stay.
         lost = 0.75 * (1 - np.square(np.clip(of_index, 0, 1)))
         lost = (1 - np.sqrt(np.maximum(1 - even * lost, 0))) / even
-        pure = entropy_of(np.concatenate([1 - lost[None], lost * rest]))
+        pure = np.concatenate([1 - lost[None], lost * rest])
         share = np.clip((lost - PURE[0]) / (PURE[1] - PURE[0]), 0, 1)
-        return np.asarray(pure + share * (entropy_of(0.25 + pattern * np.maximum(of_index, 0)) - pure))
+        return entropy_of(pure + share * (0.25 + pattern * np.maximum(of_index, 0) - pure))
 
     by_eigenvalue = -np.log(np.maximum(xi, planes["coherency_eigenvalues_errors"])) / np.log(4)
     total = image.variance_of(np.einsum("k...,k...i->...i", by_eigenvalue, slopes))
     middle, ends = at(index), []
     by_index = np.fmax(*(np.abs(at(index + side * error) - middle) for side in (-1, 1)))
     apart = np.sqrt(np.maximum(total - np.square(by_index), 0))
-    for level, (deviate, of_index) in enumerate(((1.0, np.stack([index - error, index + error])), (NORMAL_95, bounds))):
-        for side, far in ((-1, of_index[1]), (1, of_index[0])):
-            unit = np.abs(bounds[(1 - side) // 2] - index) / NORMAL_95
-            off_pure = (1 - index) / unit
-            nearest = np.where(off_pure < 4, 1 - positive(off_pure)[level][(1 + side) // 2] * unit, far)
-            end = at(np.fmin(nearest, far) if side > 0 else nearest)
-            ends.append(np.clip(middle + side * np.hypot(end - middle, deviate * apart), 0, 1))
-    low, high, *ends = ends
+    for side, end in ((-1, 1), (1, 0)):
+        unit = np.abs(bounds[end] - index) / NORMAL_95
+        off_pure = (1 - index) / unit
+        near = positive(off_pure)
+        for level, (deviate, far) in enumerate(((1.0, index - side * error), (NORMAL_95, bounds[end]))):
+            nearest = np.where(off_pure < 4, 1 - near[level][1 - end] * unit, far)
+            moved = at(np.fmin(nearest, far) if side > 0 else nearest) - middle
+            ends.append(np.clip(middle + side * np.hypot(moved, deviate * apart), 0, 1))
+    low, low_95, high, high_95 = ends
     # Next to an end of its range the estimate is not the middle of the interval: a truth there has no pull of 1.
     value = np.where((low > 0) & (high < 1), (low + high) / 2, middle)
-    known = ((bounds[0] > 0) | (bounds[1] != 1)) & np.isfinite(value + ends[0] + ends[1])
+    known = ((bounds[0] > 0) | (bounds[1] != 1)) & np.isfinite(value + low_95 + high_95)
     error = np.where(known, np.maximum(high - value, value - low), np.fmax(np.fmax(value, 1 - value), 1 / 2))
     without = np.isnan(image.errors[0, 0])
-    error, *ends = (
-        np.where(without, np.nan, np.where(known, own, end))
-        for own, end in zip((error, *ends), (error, 0.0, 1.0), strict=True)
-    )
-    put(planes, "entropy", value, error, *ends)
+    low_95, high_95 = (np.where(known, own, end) for own, end in zip((low_95, high_95), (0.0, 1.0), strict=True))
+    put(planes, "entropy", value, *(np.where(without, np.nan, part) for part in (error, low_95, high_95)))
 
 
 def entropy_of(xi: Array) -> Array:
