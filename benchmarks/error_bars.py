@@ -110,8 +110,11 @@ def cells_of(
                 true = stack[k].reshape(4, 4, 1, 1) * electrons / w[:, 0].mean()
                 true_error = 1e-6 * np.ones_like(true)
             bounds = found.get(f"{name}_95")
+            least, most = whole_range(name, value)
             if bounds is None:
                 low, high = value - NORMAL_95 * error, value + NORMAL_95 * error
+                lost = ~np.isfinite(value) & (error >= most - least)
+                low, high = np.where(lost, least, low), np.where(lost, most, high)
             else:
                 low, high = bounds[..., mine].astype(float)
             period = period_deg(name, "degree" if name.endswith("_deg") else "")
@@ -137,8 +140,8 @@ def cells_of(
             # Where there is no value the interval is everything.
             unknown = (~np.isfinite(value) & (low <= true + tolerance) & (true - tolerance <= high))[exists]
             inside_68, inside_95 = inside_68 | unknown, inside_95 | unknown
-            least, most = whole_range(name, value)
-            everything = ((low <= least + ROUNDING) & (high >= most - ROUNDING))[exists]
+            close = ROUNDING * (360 if "_deg" in name else 1)
+            everything = ((low <= least + close) & (high >= most - close))[exists]
             yield Cell(
                 name,
                 name_of_w,

@@ -360,13 +360,13 @@ def set_depolarization_power(planes: Planes, is_determined: NDArray[np.bool_]) -
 
 def set_differential(planes: Planes, is_determined: NDArray[np.bool_]) -> None:
     """Whole ranges where the logarithm does not exist or is next to where it does not."""
-    for short, bounds in DIFFERENTIAL.items():
+    for short in DIFFERENTIAL:
         name = f"differential_{short}"
         value, error = planes[name].astype(float), planes[f"{name}_errors"].astype(float)
         known = planes.get(f"{name}_95", np.stack([value - NORMAL_95 * error, value + NORMAL_95 * error]))
-        half = np.where(is_determined, error, np.maximum(value - bounds[0], bounds[1] - value))
-        ends = [np.where(is_determined, own, end) for own, end in zip(known, bounds, strict=True)]
-        put(planes, name, value, half, *ends)
+        low, high = whole_range(name, value)
+        half = np.where(is_determined, error, np.maximum(value - low, high - value))
+        put(planes, name, value, half, *np.where(is_determined, known, np.stack([low, high])))
 
 
 def set_any_dominant(planes: Planes, derived: Mapping[str, Derived], is_determined: NDArray[np.bool_]) -> None:

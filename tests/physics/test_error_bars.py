@@ -216,6 +216,14 @@ def test_entropy_covers_at_both_its_ends_and_where_an_eigenvalue_may_be_zero(ins
     assert electrons == 60 or np.median([cell.rms for cell in mine]) == pytest.approx(1, abs=0.1)
 
 
+def test_an_axis_that_is_not_determined_has_its_whole_period_about_its_value() -> None:
+    """That of the differential decomposition had 0 to 180 degrees, which counts as a miss where it passes 180."""
+    found = cells("127 degrees, 9 to 1, 41", 0, 60, 200, samples=["retarder 2"], first_seed=21)
+    cell = next(c for c in found if c.quantity == "differential_retardance_fast_axis_deg")
+    assert cell.everything > 0.9
+    assert cell.in_95 > 0.95
+
+
 def test_where_m00_is_noise_every_interval_is_everything() -> None:
     """Without light enough the ratio to m00 is no normal variate: 95 % intervals covered 43 %."""
     found = list(cells("24 others", 0, 20, 400, samples=["mirror", "retarder 2", "ideal depolarizer"], extra=EXTRA))
