@@ -66,6 +66,10 @@ class Effect:
     is_projected: ClassVar[bool] = False
     #: Holds where an instrument file names it, and is not looked for: an unknown sample would take it up.
     from_file_only: ClassVar[bool] = False
+    #: Its values trade off along a bent valley: slopes at zero tell little, so a search begins at its own minimum too.
+    has_bent_valley: ClassVar[bool] = False
+    #: Part of what it explains (chi-square) that its simple form may leave over.
+    rough: ClassVar[float] = 0.0
     #: The one look or capture that shows it, if there is one, in a sentence.
     advice: ClassVar[str] = ""
 

@@ -19,11 +19,7 @@ from scipy import ndimage
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.search.range_of import inside_and_outside, range_of
-from processing.diagnosis.search.rules import (
-    FEWEST_OF_MANY,
-    MOSTLY,
-    OUTSTANDING,
-)
+from processing.diagnosis.search.rules import FEWEST_OF_MANY, MOSTLY, OUTSTANDING
 
 #: [robust standard deviations] From which on an intensity is a hit: the largest of 10^9 normal ones is 6.1.
 HIT = 8.0

@@ -20,9 +20,7 @@ from processing.arrays import Array, BoolArray
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.features import FEATURES
 from processing.diagnosis.instrument.pixel_sums import Pixels, Precision, features_of_pixels, products_of_pixels
-from processing.diagnosis.search.rules import (
-    TILES,
-)
+from processing.diagnosis.search.rules import TILES
 from processing.instrument.changes import places
 
 #: [intensities of a pixel] Beyond which states are held out, not tiles of the image.

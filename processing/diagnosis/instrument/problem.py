@@ -19,11 +19,7 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
-from processing.diagnosis.instrument.moments import (
-    Moments,
-    folds_of,
-    moments_of,
-)
+from processing.diagnosis.instrument.moments import Moments, folds_of, moments_of
 from processing.diagnosis.instrument.photon_noise import distance, exactly_undone, movable, undoing, with_noise_of_light
 from processing.diagnosis.instrument.projection import add_block, noise_information
 from processing.diagnosis.instrument.slopes import Columns, slopes_of_counts, slopes_of_rows
@@ -325,7 +321,8 @@ class InstrumentProblem:
             mine, own = acting.space, acting.of(values)
             part = Sums.empty(self.folds, mine.size if derivatives else 0)
             changes = self.changes(k, mine, own)
-            if changes.field_retardance_rad or (derivatives and self._has_field(mine)):
+            varies = derivatives and any(c.effect.varies_over_image for c in mine.candidates)
+            if changes.field_retardance_rad or varies:
                 self._tile_sums(k, mine, own, changes, out=part, derivatives=derivatives)
             else:
                 self._block_sums(k, mine, own, changes, out=part, derivatives=derivatives)
@@ -369,9 +366,6 @@ class InstrumentProblem:
             for c in levels:
                 out[parts[c]] = (gains[1] / gains[0] - 1) ** 2
         return out
-
-    def _has_field(self, space: Space) -> bool:
-        return any(c.effect.varies_over_image for c in space.candidates)
 
     def _block_sums(
         self, k: int, space: Space, values: Array, changes: Changes, *, out: Sums, derivatives: bool

@@ -66,7 +66,8 @@ def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
     state, (values, covariance) = found.samples.best, found.of_likeliest()
     out = []
     for k in found.there:
-        odds = found.in_place_of(k)
+        # Of every group to be there in the place of this one, its own among them.
+        odds = found.sets.conditional(found.sets.without(state, k)).log_odds
         least = least_odds(odds[k], left / state.unit)
         rivals = found.sets.free & (state.tau == 0) & (odds > least)
         others = [int(j) for j in np.argsort(-odds) if rivals[j]]

@@ -14,14 +14,7 @@ from scipy.special import ndtr
 from processing.arrays import Array
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.result import Check, Verdict
-from processing.diagnosis.search.rules import (
-    CHANCE_WORSE,
-    LEAST_CHANGE,
-    LIMIT,
-    LIMIT_OF_TWO,
-    WORSE,
-    WORSE_CONDITION,
-)
+from processing.diagnosis.search.rules import CHANCE_WORSE, LEAST_CHANGE, LIMIT, LIMIT_OF_TWO, WORSE, WORSE_CONDITION
 
 #: [of the largest] Singular value of W from which on a direction is measured.
 MEASURED = 1e-6

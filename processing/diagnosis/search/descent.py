@@ -48,6 +48,12 @@ def all_at_once(
     return out
 
 
+def alone(problem: Problem, space: Space, chosen: Sequence[int]) -> Array:
+    """Values (K,) of some candidates, by their numbers, at their own minimum; all others at zero."""
+    part = Space(tuple(space.candidates[k] for k in chosen))
+    return space.vector(part.split(minimize(problem, part, np.zeros(part.size)).values))
+
+
 def next_values(problem: Problem, space: Space, sets: Sets, state: State, *, x: Array) -> tuple[Array, bool]:
     """Values (K,) about which to linearize next, and whether they are so near to x (K,) that there is no need."""
     samples = sample(sets, state, SAMPLES_BEFORE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from processing.arrays import BoolArray
 from processing.diagnosis.search.rules import ALTERNATIVE, NEEDED
 from processing.diagnosis.search.sets import NEVER, Sets, State
 
@@ -16,11 +17,18 @@ STEPS = 60
 AT_ONCE = 6
 
 
-def likely_set(sets: Sets) -> State:
-    """The likeliest of some: several causes together can be plain where each alone is nothing, and the reverse."""
-    up = climb(sets, sets.empty())
-    down = climb(sets, thinned(sets))
-    return max(up, down, key=lambda s: sets.fitted(s).score)
+def likely_set(sets: Sets, kept: BoolArray | None = None) -> State:
+    """The likeliest of some: several causes together can be plain where each alone is nothing, and the reverse.
+
+    Also from the groups `kept` (G,) on, in the unit of noise: in that of structure a prior is too stiff for what would
+    explain it.
+    """
+    found = [climb(sets, sets.empty()), climb(sets, thinned(sets))]
+    if kept is not None:
+        begin = State(np.where(kept & sets.free, 1.0, sets.empty().tau), sets.noise.floor)
+        retune(sets, begin)
+        found.append(climb(sets, begin))
+    return max(found, key=lambda s: sets.fitted(s).score)
 
 
 def climb(sets: Sets, state: State) -> State:

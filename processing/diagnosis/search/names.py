@@ -55,6 +55,8 @@ def with_parts(
             general = cause.candidates[0].effect.per_state or cause.candidates[0].is_pointwise
             rest = found.sets.noise.directions if general else 0.0
             weak = cause.log_odds < max(CERTAIN, TIMES * rest / 2)
+        # What the simple form of another cause leaves over is no cause of its own.
+        weak |= any(cause.log_odds < o.candidates[0].effect.rough * o.log_odds for o in causes)
         if cause not in out and weak:
             out[cause] = PART_OF_LEFT
     # A sentence is a part of an unknown mechanism, whose other parts look like effects of the list.

@@ -11,10 +11,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processing.arrays import Array
+from processing.arrays import Array, BoolArray
 from processing.diagnosis.search.averages import Samples, sample, stay
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.descent import STEPS, all_at_once, improved, mean_over_sets, minimum_of, next_values
+from processing.diagnosis.search.descent import (
+    STEPS,
+    all_at_once,
+    alone,
+    improved,
+    mean_over_sets,
+    minimum_of,
+    next_values,
+)
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
 from processing.diagnosis.search.rules import (
@@ -65,10 +73,6 @@ class Posterior:
         """Groups of the likeliest set that might be absent."""
         return [int(k) for k in np.flatnonzero((self.samples.best.tau > 0) & self.sets.free)]
 
-    def in_place_of(self, group: int) -> Array:
-        """Log odds (G,) of every group to be there in the place of one of the likeliest set, its own among them."""
-        return self.sets.conditional(self.sets.without(self.samples.best, group)).log_odds
-
     def of_likeliest(self) -> tuple[Array, Array]:
         """Values (K,) and covariance (K, K) of the likeliest set alone, in the units of the parameters."""
         typical, fit = self.space.joined("typical"), self.sets.fitted(self.samples.best)
@@ -90,8 +94,7 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     start : (K,) values to begin with.
     """
     members, groups = grouped(space, fixed)
-    bends = [g for g, own in enumerate(members) if space.candidates[own[0]].is_pointwise]
-    about, sets, state, others = _found(problem, space, fixed, groups, start=start, bends=bends)
+    about, sets, state, others = _found(problem, space, fixed, members, groups=groups, start=start)
     # Where what is left is the noise, each set has a unit of its own, and counts by its evidence.
     samples = stay(sets, state, CHANGES) if sets.noise.known else sample(sets, state, SAMPLES)
     there = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
@@ -101,41 +104,45 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
 
 @dataclass(frozen=True, eq=False)
 class _Round:
-    """The problem linearized `about` values (K,), with the `excess` there, and a likely set in it."""
+    """The problem linearized `about` values (K,), with the `excess` there, and a likely set in it.
+
+    `keeps` : the next round begins at this set too.
+    """
 
     about: Array
     excess: float
     sets: Sets
     state: State
+    keeps: bool
 
     @property
     def score(self) -> float:
         return self.sets.fitted(self.state).score
 
 
-#: Linearizes about values (K,); None where the model has no intensities.
-Look = Callable[[Array], _Round | None]
+#: Linearizes about values (K,), and finds a set from some groups (G,) on too; None where the model has no intensities.
+Look = Callable[[Array, BoolArray | None], _Round | None]
 
 
 def _found(
     problem: Problem,
     space: Space,
     fixed: Sequence[Candidate],
-    groups: Sequence[Group],
+    members: Sequence[tuple[int, ...]],
     *,
+    groups: Sequence[Group],
     start: Array,
-    bends: Sequence[int],
 ) -> tuple[Array, Sets, State, dict[int, tuple[int, ...]]]:
     """Values (K,) about which it was linearized, the sets there, the likeliest of them, and what does as well."""
 
-    def look(x: Array) -> _Round | None:
+    def look(x: Array, kept: BoolArray | None = None) -> _Round | None:
         problem.relinearize(space, x)
         sums = problem.sums(space, x)
         form = quadratic(problem, space, x, sums)
         if not (np.isfinite(form.excess) and np.all(np.isfinite(form.curvature))):
             return None
         sets = Sets(form, groups, noise_of(problem, sums))
-        return _Round(x, form.at(x / space.joined("typical")), sets, likely_set(sets))
+        return _Round(x, form.at(x / space.joined("typical")), sets, likely_set(sets, kept), kept is not None)
 
     first = look(start)
     assert first is not None, "the instrument as declared has no intensities"
@@ -143,11 +150,15 @@ def _found(
     if first.state.unit > BENT or not problem.noise_known:
         # Several large causes, none of which explains much alone, or far from linear: from all of them at once as well.
         begun.append(look(all_at_once(problem, space, fixed, start, noise=first.sets.noise, tau=TAU[-1])))
+        bent = [g for g, own in enumerate(members) if space.candidates[own[0]].effect.has_bent_valley]
+        by_itself = [look(alone(problem, space, members[g]), np.arange(len(groups)) == g) for g in bent]
+        begun += [one for one in by_itself if one is not None and one.score > first.score]
     rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
     ended = [_settled(problem, space, one, look, rounds=rounds) for one in begun if one is not None]
     last = max(ended, key=lambda one: one.score)
     problem.relinearize(space, last.about)
     down = problem.noise_known and last.state.unit <= BENT
+    bends = [g for g, own in enumerate(members) if space.candidates[own[0]].is_pointwise]
     # Structure is described by whatever comes nearest to it: what is found beside it is not compared so closely.
     last, others = _of_bends(problem, space, last, bends if down else (), look=look)
     return last.about, last.sets, last.state, others
@@ -166,7 +177,7 @@ def _of_bends(
         for j in (g for g in bends if found.state.tau[g] == 0):
             state = found.sets.without(found.state, k)
             state.tau[j] = found.state.tau[k]
-            other = look(minimum_of(problem, space, found.sets, found.sets.settled(state)))
+            other = look(minimum_of(problem, space, found.sets, found.sets.settled(state)), None)
             rounds += [other] if other is not None else []
     best = max(rounds, key=lambda one: one.score)
     problem.relinearize(space, best.about)
@@ -190,7 +201,7 @@ def _settled(problem: Problem, space: Space, first: _Round, look: Look, *, round
         x, settled = next_values(problem, space, now.sets, now.state, x=now.about)
         if settled:
             break
-        new = look(x)
+        new = look(x, now.state.tau > 0 if now.keeps else None)
         if new is None:
             break
         noise, told = now.sets.noise, now.sets.form.at(x / space.joined("typical"))

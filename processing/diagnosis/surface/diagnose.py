@@ -67,12 +67,12 @@ def diagnose_surface(problem: SurfaceProblem, material: str, say: Say) -> Surfac
     found = posterior(problem, space, (), np.zeros(space.size), say=say)
     say("testing what is left over")
     solved, captures = solution(problem, found, Space(()), np.zeros(0)), range(len(problem.captures))
-    found, covariance = as_wide_as_the_valley(problem, found, solved)
+    found, covariance, wider = as_wide_as_the_valley(problem, found, solved)
     (before, _), (after, left) = (
         zip(*(structure(problem, k, at, fit.values) for k in captures), strict=True) for at, fit in solved.ends
     )
     has_structure = any(map(beyond_chance, after))
-    names = names_of(found, sum(left) if has_structure else 0.0)
+    names = names_of(found, wider, sum(left) if has_structure else 0.0)
     judgement = Judgement(
         named=bool(names.named),
         sure=bool(names.named),
@@ -85,16 +85,27 @@ def diagnose_surface(problem: SurfaceProblem, material: str, say: Say) -> Surfac
     return SurfaceJudged(_told(answer, problem, material, before=before, after=after), answer.kept)
 
 
-def names_of(found: Posterior, left: float) -> Names:
-    """Likely causes without those that may be something else; `left` is the chi-square of structure."""
-    part, likely = dict(found.space.pairs), [c for c in causes(found, left) if c.probability >= LIKELY]
+def names_of(found: Posterior, wider: Array, left: float) -> Names:
+    """Likely causes without those that may be something else; `left` is the chi-square of structure.
+
+    Their errors are `wider` (K,) than slopes promise.
+    """
+    likely, part = [c for c in causes(found, left) if c.probability >= LIKELY], dict(found.space.pairs)
     doubt = with_parts(found, likely, {c: AT_BOUND for c in likely if at_bound(c)}, left=left, noise_known=True)
-    covariance = [tuple(found.covariance[part[one], part[one]] for one in c.candidates) for c in likely]
-    return Names(tuple(replace(c, covariance=v) for c, v in zip(likely, covariance, strict=True) if c not in doubt), {})
+    named = []
+    for cause in (c for c in likely if c not in doubt):
+        factors = [np.outer(wider[part[one]], wider[part[one]]) for one in cause.candidates]
+        widened = tuple(v * f for v, f in zip(cause.covariance, factors, strict=True))
+        named.append(replace(cause, covariance=widened))
+    return Names(tuple(named), {})
 
 
-def as_wide_as_the_valley(problem: SurfaceProblem, found: Posterior, solved: Solution) -> tuple[Posterior, Array]:
-    """The posterior, and the covariance (K, K) of the values that are corrected, as wide as the chi-square is.
+def as_wide_as_the_valley(
+    problem: SurfaceProblem, found: Posterior, solved: Solution
+) -> tuple[Posterior, Array, Array]:
+    """The posterior and the covariance of the values that are corrected, as wide as the chi-square is.
+
+    Also by how much wider each value (K,) of the posterior is.
 
     Slopes at one point promise less than a bent valley holds. Along each principal axis an error is a third of the way
     to where chi-square and prior, the mean of both sides, have risen by nine.
@@ -113,7 +124,8 @@ def as_wide_as_the_valley(problem: SurfaceProblem, found: Posterior, solved: Sol
         wide[j] = np.clip(SHOWN / np.sqrt(rise), 1.0, MOST_WIDER)
     covariance = found.covariance.copy()
     covariance[np.ix_(index, index)] = (axes * size * wide**2) @ axes.T * np.outer(typical, typical)
-    return replace(found, covariance=covariance), covariance[np.ix_(index, index)]
+    wider = np.sqrt(np.diag(covariance) / np.maximum(np.diag(found.covariance), 1e-300))
+    return replace(found, covariance=covariance), covariance[np.ix_(index, index)], wider
 
 
 def _told(

@@ -17,10 +17,11 @@ ENTRY_POINTS = "umov.reflectance_effects"
 class ReflectanceEffect(Effect, ABC):
     """One thing that the model of a surface can lack.
 
-    `corrects` says in which file it is corrected.
+    `corrects` says in which file it is corrected. Beside it no effect is named that explains less than it leaves over.
     """
 
     corrects: ClassVar[Literal["", "material", "geometry"]] = ""
+    rough = 1e-3
 
     def places_on(self, shape: str) -> Sequence[str]:
         """Where it can act on an object in front of a camera: `shape` is "sphere", "flat" or "mesh"."""

@@ -24,6 +24,10 @@ class Interreflection(ReflectanceEffect):
     its own pixels tell.
     """
 
+    # A support is no disc, and where its light is cut off by the object itself is not known.
+    rough = 0.2
+    has_bent_valley = True
+
     def places_on(self, shape: str) -> Sequence[str]:
         return ("", "support")
 

@@ -16,6 +16,7 @@ class PolarizedDiffuse(ReflectanceEffect):
     """Weight a sin^b(theta_h) of the diffuse term in the Jones matrix; log_b = ln b."""
 
     corrects = "material"
+    has_bent_valley = True
 
     def parameters(self, place: str) -> tuple[Parameter, ...]:
         return (Parameter("a", "1", -2.0, 2.0, 0.1), Parameter("log_b", "1", -1.5, 2.0, 0.5))

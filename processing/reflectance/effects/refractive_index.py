@@ -16,6 +16,7 @@ class RefractiveIndex(ReflectanceEffect):
     """What has to be added to n and k; more than these bounds is another material, or no first surface at all."""
 
     corrects = "material"
+    has_bent_valley = True
 
     def parameters(self, place: str) -> tuple[Parameter, ...]:
         return (Parameter("n", "1", -0.3, 0.3, 0.05), Parameter("k", "1", -0.3, 0.3, 0.05))
