@@ -17,10 +17,12 @@ from processing.instrument.elements import Element, Retarder
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
 
-#: [log odds] Price of a sentence without a name: one fault in some hundred is none of the list.
-PRICE = 6.0
+#: [log odds] Price of a sentence without a name: with some hundred sentences one fault in seven is none of the list.
+PRICE = 3.0
 #: [log odds] Price of each period a turn beyond the second.
 OF_A_HARMONIC = 0.5
+#: [log odds] Price of each further kind of quantity: most mechanisms change one.
+OF_A_PART = 2.0
 #: [sizes] Bounds of every value.
 REACH = 20.0
 #: [degree] Turn of an element from which on harmonics of its angle are more than a slope.
@@ -42,6 +44,9 @@ OF_A_PLATE = (
     "depolarization",
     "inner reflection",
 )
+#: Parts of what one mechanism does to a plate: it is tilted, or light of another kind or direction passes it too.
+TOGETHER = ("azimuth", "retardance", "circular retardance", "depolarization")
+TOGETHER_TURNING = ("gain", "azimuth", "retardance", "diattenuation")
 #: Quantities of the way between the trains.
 OF_THE_PATH = (
     ("retardance at 0 degrees", "retardance at 45 degrees"),
@@ -116,10 +121,11 @@ class Sentence:
     def price(self, conditions: Conditions) -> float:
         """[log odds] Prior odds against the sentence: more for a high harmonic, and for one of many states or waves."""
         kind, _, rest = self.course.partition(" ")
+        price = PRICE + OF_A_PART * (len({q.split()[0] for q in self.quantities}) - 1)
         if kind == "by":
-            return PRICE + OF_A_HARMONIC * max(int(rest.split()[0]) - 2, 0)
+            return price + OF_A_HARMONIC * max(int(rest.split()[0]) - 2, 0)
         of_several = {"from": conditions.states, "beating": _beats(conditions.states).size}.get(kind, 1)
-        return PRICE + float(np.log(of_several))
+        return price + float(np.log(of_several))
 
     def parameters(self, conditions: Conditions) -> tuple[Parameter, ...]:
         """One for each quantity and each part of the course."""
@@ -306,6 +312,8 @@ def _of_element(
         yield from _waves("source", ("gain",), own, (3, 4))
         yield from _waves(name, ("diattenuation",), own, (1, 2))
         if own:
+            yield Sentence(name, TOGETHER)
+            yield from _waves(name, TOGETHER_TURNING, own, (1, 2))
             yield from (Sentence(name, (quantity,)) for quantity in OF_A_PLATE)
             yield from (Sentence(name, (q,), time) for time in times[1:] for q in ("azimuth", "retardance"))
     else:

@@ -1,11 +1,13 @@
 """What no effect of the list has a name for is not called after one that looks like it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from processing.arrays import Array
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis
 from processing.instrument.changes import Changes, Conditions
@@ -17,6 +19,7 @@ from simulators.blind.outside_list import ghost, image_lag, lamp_jump
 from simulators.blind.real_bench import RoundSample
 from simulators.blind.undeclared_captures import (
     TrueBench,
+    TrueScene,
     declared_bench,
     digitize,
     expose,
@@ -36,13 +39,28 @@ def bench(configs: Path) -> TrueBench:
 
 def diagnosed(folder: Path, configs: Path, bench: TrueBench, drift_counts: float = 0.0) -> Diagnosis:
     """A bright disc before a dark background, of unknown Mueller matrix; the black level may drift."""
-    file, random = configs / "instruments/rgb950.yaml", np.random.default_rng(4)
-    angles = state_angles(STATES, False, False)
-    counts = digitize(bench, expose(bench, RoundSample(random), angles), random)
+    random, angles = np.random.default_rng(4), state_angles(STATES, False, False)
+    light = expose(bench, RoundSample(random), angles)
+    return diagnosed_from(folder, configs, bench, light, random=random, drift_counts=drift_counts)
+
+
+def diagnosed_from(
+    folder: Path,
+    configs: Path,
+    bench: TrueBench,
+    light: Array,
+    *,
+    random: np.random.Generator,
+    sample: str = "unknown",
+    drift_counts: float = 0.0,
+) -> Diagnosis:
+    """The same of the light of any sample."""
+    file, path = configs / "instruments/rgb950.yaml", folder / "capture.h5"
+    counts = digitize(bench, light, random)
     moved = np.round(np.linspace(0, drift_counts, STATES)).reshape(-1, *(1,) * (counts.ndim - 1))
     counts = (counts + moved).astype(counts.dtype)
-    path = folder / "capture.h5"
-    write_capture(path, bench, counts, angles, sample=Sample(kind="unknown"), instrument=file.read_text())
+    angles = state_angles(STATES, False, False)
+    write_capture(path, bench, counts, angles, sample=Sample(kind=sample), instrument=file.read_text())
     return diagnose_captures([path], InstrumentModel.load(file))[0].diagnosis
 
 
@@ -225,3 +243,17 @@ def test_a_name_beside_a_fault_without_one_is_likely(configs, tmp_path, bench):
     found = diagnosed(tmp_path, configs, bench)
     assert {e.kind: e.answer for e in found.effects} == {"unlisted": "unlisted", "beam_wander": "likely"}
     assert found.verdict == "explained"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sample", ["air", "unknown"])
+def test_light_of_two_directions_in_a_plate_is_no_plate_that_is_turned(sample, configs, tmp_path, bench):
+    """An unknown sample takes up all of it but what an azimuth does as well; air shows its parts, which are many."""
+    random, angles = np.random.default_rng(4), state_angles(STATES, False, False)
+    scene = TrueScene(random, np.eye(4)) if sample == "air" else RoundSample(random)
+    other = replace(bench, og=bench.og + 0.6)
+    light = 0.97 * expose(bench, scene, angles) + 0.03 * expose(other, scene, angles)
+    found = diagnosed_from(tmp_path, configs, bench, light, random=random, sample=sample)
+    assert not sure(found)
+    assert any("psg_retarder" in sentence for sentence in sentences(found))
+    assert found.applied()

@@ -54,6 +54,21 @@ def test_probabilities_are_those_of_all_sets(average):
     assert found.any_of([0, 1]) > 0.99
 
 
+def test_one_cause_that_does_what_two_do_has_its_share_from_either_side():
+    """Between them lies a set of all three, or one that leaves half of the data: no chain passes that."""
+    half = 60 * np.random.default_rng(5).standard_normal((90, 4))
+    design = np.hstack([half, half])
+    made = [*groups(2, 2), Group(np.arange(4, 8), price=5.5)]
+    sets = Sets(form(design, np.array([0.5, -0.4, 0.3, 0.5, 0, 0, 0, 0]), 2), made, QUIET, count=400)
+    taus = np.array(list(product([0.0, *TAU], repeat=3)))
+    scores = np.array([sets.fitted(State(tau)).score for tau in taus])
+    weight = np.exp(scores - scores.max())
+    exact = float(weight @ (taus[:, 2] > 0) / weight.sum())
+    assert 0.2 < exact < 0.8
+    for start in ([0.3, 0.3, 0.0], [0.0, 0.0, 0.3]):
+        assert stay(sets, State(np.array(start)), 1000).probability[2] == pytest.approx(exact, abs=0.2)
+
+
 def test_a_rare_cause_of_nearly_all_structure_is_found_behind_common_ones_that_explain_nothing():
     """What it leaves has a smaller unit, in which it is plain; in the unit of all structure nothing is."""
     curvature = np.diag([1.0] * 30 + [1500.0])

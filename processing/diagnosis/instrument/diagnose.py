@@ -149,7 +149,7 @@ def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: 
     each = dict(zip((c.name for c in problem.captures), of_each, strict=True)) if len(of_each) > 1 else {}
     lasting = lasts(later, names.doubt.values())
     judgement = Judgement(
-        named=bool(names.named or switched),
+        named=bool(names.named or switched or found.any_cause),
         sure=bool(names.sure or switched),
         structure=used.structure or bool(names.untold),
         seen=bool(would_be_seen(found)),

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
+from processing.diagnosis.search.likely_set import climb
 from processing.diagnosis.search.rules import ALTERNATIVE, CERTAIN, SHARES
 from processing.diagnosis.search.sets import Conditional, Group, Quadratic, Sets, State, probability_at
 
@@ -285,9 +286,12 @@ def _starts(sets: Sets, state: State) -> list[tuple[State, float]]:
     """States to start from, and what share of the changes each has: the likely one, and those that are as likely.
 
     Of two groups that say the same the chain may never see the second: it would have to pass a set with both or with
-    none.
+    none. One that does what several do would need them all to go at once.
     """
-    states = [state, *swapped(sets, state)]
+    there = np.flatnonzero((state.tau > 0) & sets.free)
+    instead = (climb(sets, sets.without(state, int(k)), without=int(k)) for k in there)
+    several = (State(s.tau, state.unit) for s in instead)
+    states = {s.tau.tobytes(): s for s in (state, *swapped(sets, state), *several)}.values()
     score = np.array([sets.fitted(s).score for s in states])
     share = np.exp(score - score.max())
     share /= share.sum()

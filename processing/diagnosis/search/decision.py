@@ -121,7 +121,7 @@ class Judgement:
 
     Attributes
     ----------
-    named, sure : whether any cause has a name, and whether nothing speaks against one of them.
+    named, sure : whether a cause is there, and whether nothing speaks against the name of one.
     structure : whether tests see something in what is left.
     seen : whether a fault of typical size would have been seen.
     figures : of the residual and of W, before and after; chances : that what the user reads gets worse.

@@ -31,10 +31,11 @@ def likely_set(sets: Sets, kept: BoolArray | None = None) -> State:
     return max(found, key=lambda s: sets.fitted(s).score)
 
 
-def climb(sets: Sets, state: State) -> State:
-    """The change of one group that gains most, as long as one gains; the unit follows."""
+def climb(sets: Sets, state: State, without: int | None = None) -> State:
+    """The change of one group that gains most, as long as one gains; the unit follows. One group may stay away."""
     state = sets.settled(state.copy())
-    best, barred = sets.fitted(state).score, np.zeros(len(sets.groups), dtype=bool)
+    away = np.arange(len(sets.groups)) == without
+    best, barred = sets.fitted(state).score, away.copy()
     for _ in range(STEPS):
         c = sets.conditional(state, follow=True)
         there = state.tau > 0
@@ -47,7 +48,7 @@ def climb(sets: Sets, state: State) -> State:
         now = sets.fitted(sets.settled(tried)).score
         if now > best:
             state, best = tried, now
-            barred[:] = False
+            barred = away.copy()
             retune(sets, state)
         else:
             barred[k] = True

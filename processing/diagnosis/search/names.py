@@ -60,8 +60,7 @@ def with_parts(
         if cause not in out and weak:
             out[cause] = PART_OF_LEFT
     # A sentence is a part of an unknown mechanism, whose other parts look like effects of the list.
-    unlisted = [k for k in range(len(found.members)) if found.label(k).price]
-    if found.samples.any_of(unlisted) > 0.5:
+    if any(found.label(k).price for k in found.there):
         out |= {cause: PART_OF_UNLISTED for cause in causes if cause not in out and cause.answer != "unlisted"}
     return out
 

@@ -34,6 +34,7 @@ from processing.diagnosis.search.rules import (
     GROWTH,
     ROUNDS,
     SAMPLES,
+    SURE,
     TAU,
 )
 from processing.diagnosis.search.sets import Group, Sets, State
@@ -67,6 +68,11 @@ class Posterior:
     def score(self) -> float:
         """Log probability of the likeliest set, a constant left out."""
         return self.sets.fitted(self.samples.best).score
+
+    @property
+    def any_cause(self) -> bool:
+        """Whether some group is there for sure, be it that none is by itself."""
+        return self.samples.any_of(np.flatnonzero(self.sets.free).tolist()) >= SURE
 
     @property
     def there(self) -> list[int]:
