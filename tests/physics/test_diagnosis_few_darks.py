@@ -83,3 +83,35 @@ def test_noise_of_darks_is_no_fault_where_states_are_dark(camera, darks, texture
     found = diagnose_captures([path], model)[0].diagnosis
     assert (found.verdict, found.effects) == ("consistent", ())
     assert camera != SIXTEEN_BITS or found.noise.verdict == "as_declared"
+
+
+def test_a_bend_is_named_where_read_noise_is_a_quarter_of_a_count(synthetic_capture):
+    """What rounding may do to whole frames is no reason to look no longer at the noise of the light behind a bend."""
+    turned, bend, gain = 4.5 * np.arange(40), 0.03, 1.3
+    file = synthetic_capture.folder / "crossed.yaml"
+    stated = CROSSED.replace("axis: psg, azimuth_deg: 0, retardance_deg: 90", "axis: psg, retardance_deg: 101")
+    stated = stated.replace("axis: psa, azimuth_deg: 0, retardance_deg: 90", "axis: psa, retardance_deg: 121")
+    file.write_text(stated)
+    true = synthetic_capture.folder / "true.yaml"
+    true.write_text(stated.replace("121", "120"))
+    angles = {"psg": turned, "psa": 5 * turned}
+    light = InstrumentModel.load(true).at(662).rows(angles).reshape(-1, 16) @ np.eye(4).ravel()
+    random = np.random.default_rng(78)
+    mean = np.maximum(light, 0)[:, None, None, None] * np.full((48, 64), 7_800.0)
+    electrons = random.poisson(mean * (1 - bend * mean / (4095 * gain)))
+    frames = np.concatenate([np.zeros((4, 1, 48, 64)), electrons])
+    frames = frames + random.normal(0, 0.35, frames.shape)
+    path = synthetic_capture(
+        np.round(frames / gain + 8.3).astype(np.uint16),
+        {axis: np.r_[np.zeros(4), a] for axis, a in angles.items()},
+        role=("dark",) * 4 + ("sample",) * 40,
+        sample={"kind": "air"},
+        instrument_yaml=stated,
+        detector={"gain_e_per_count": gain, "read_noise_e": 0.35, "bits": 12},
+    )
+    found = diagnose_captures([path], InstrumentModel.load(file))[0].diagnosis
+    assert found.verdict == "explained"
+    values = {effect.kind: next(iter(effect.parameters.values())) for effect in found.effects}
+    plate, curve = values["psa_retardance"], values["detector_nonlinearity"]
+    assert (plate.value, plate.stderr) == (pytest.approx(-1, abs=0.05), pytest.approx(0.01, abs=0.005))
+    assert (curve.value, curve.stderr) == (pytest.approx(bend, abs=0.002), pytest.approx(0.0005, abs=0.0003))

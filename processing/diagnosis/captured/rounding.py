@@ -60,10 +60,12 @@ def rounded_off(counts: NDArray[np.float32], noise: float, *, image: bool = True
     likelihood = np.log(np.maximum(share, 1e-300)) @ number
     weight = np.exp(likelihood - likelihood.max())
     weight /= weight.sum()
-    mean = float(np.sum(weight @ level))
-    shift = mean - float(near.mean() - middle)
-    variance = float(np.sum(weight @ (level - mean) ** 2))
-    of_counts = np.sum(share * steps**2, axis=2) - np.sum(share * steps, axis=2) ** 2
+    # Of counts that are not normal the mean is kept: only what rounding does to a normal one of their spread is added.
+    of_mean = share @ steps
+    taken = level[:, 0] - of_mean
+    shift = float(np.sum(weight * taken))
+    variance = float(np.sum(weight * (taken - shift) ** 2))
+    of_counts = share @ steps**2 - of_mean**2
     # What the image spreads is no noise.
     of_pixel = float(np.sum(weight * np.maximum(of_counts - spread[..., 0] ** 2 + noise**2, LEAST**2)))
     return shift, variance + (NOT_NORMAL * shift * image) ** 2, of_pixel / (noise**2 + QUANTIZATION)

@@ -68,7 +68,7 @@ def with_noise_of_light(data: CaptureData, a: Array, bends: Mapping[Candidate, A
     ----------
     data : not moved; a (L, K) : rows of its model, not weighted.
     """
-    shared = data.shared.shown < 1 or data.wide is not None
+    shared = data.shared.shown < 1 or data.shared.rows > 0 or data.shared.columns > 0
     if not data.noise_known or data.noise_estimated or shared:
         return _of_light(data, bends)
     least, usual = max(abs(data.noise_level[0] - 1), GAIN_OFF), (1.0, 1.0)
@@ -109,5 +109,8 @@ def _of_light(data: CaptureData, bends: Mapping[Candidate, Array]) -> CaptureDat
 
 
 def _shown(data: CaptureData, a: Array, bends: Mapping[Candidate, Array]) -> DetectorNoise | None:
+    if data.wide is not None:
+        # Differences of pixels show nothing of what is common to all of them.
+        data = replace(data, slope=data.slope / data.wide, floor=data.floor / data.wide)
     corrected = _of_light(data, bends)
     return detector_noise(corrected.undone(undoing(data, bends)) if bends else corrected, a)
