@@ -50,15 +50,11 @@ def _capture(
 ) -> str:
     """One sentence: the capture that separates the rivals, or shows the unseen, or that none of the usual does."""
     rows_side = [c for c in rivals if not c.acts_on_counts]
-    have = [c.sample for c in problem.captures]
-    best, power = "", 0.0
-    for name, sample in SAMPLES.items():
-        if any(h is not None and np.allclose(h / np.abs(h).max(), sample.reshape(16) / sample.max()) for h in have):
-            continue
-        value = _power(problem, space, fit, sample, rivals=rows_side, unseen=unseen)
-        # A simpler sample is preferred unless another one tells clearly more.
-        if value > power + CLEARLY_MORE:
-            best, power = name, value
+    best, power = _best_sample(problem, space, fit, rows_side, unseen=unseen)
+    listed = [c for c in rows_side if not c.price]
+    if power < APART and 1 < len(listed) < len(rows_side):
+        # A sentence can be an exact double of an effect; what separates the effects still helps.
+        best, power = _best_sample(problem, space, fit, listed, unseen=unseen)
     if any(c.acts_on_counts for c in rivals):
         return (
             "A series of exposure times on an unpolarized, evenly lit target tells detector effects from optics; "
@@ -73,6 +69,22 @@ def _capture(
             "No usual sample separates them with these states; another state table, or a second detector channel, may."
         )
     return "None needed." if not unseen else f"Capture {best or next(iter(SAMPLES))} to see what is unobservable here."
+
+
+def _best_sample(
+    problem: InstrumentProblem, space: Space, fit: Fit, rivals: Sequence[Candidate], *, unseen: Sequence[Candidate]
+) -> tuple[str, float]:
+    """The sample not captured yet that tells the most, and how much."""
+    have = [c.sample for c in problem.captures]
+    best, power = "", 0.0
+    for name, sample in SAMPLES.items():
+        if any(h is not None and np.allclose(h / np.abs(h).max(), sample.reshape(16) / sample.max()) for h in have):
+            continue
+        value = _power(problem, space, fit, sample, rivals=rivals, unseen=unseen)
+        # A simpler sample is preferred unless another one tells clearly more.
+        if value > power + CLEARLY_MORE:
+            best, power = name, value
+    return best, power
 
 
 def _power(
