@@ -82,7 +82,9 @@ def test_noise_of_darks_is_no_fault_where_states_are_dark(camera, darks, texture
     )
     found = diagnose_captures([path], model)[0].diagnosis
     assert (found.verdict, found.effects) == ("consistent", ())
-    assert camera != SIXTEEN_BITS or found.noise.verdict == "as_declared"
+    if camera == SIXTEEN_BITS:
+        # Of 8 bits the rounding of the dark frames of single pixels is known less well than their noise.
+        assert found.noise.verdict == "as_declared"
 
 
 def test_a_bend_is_named_where_read_noise_is_a_quarter_of_a_count(synthetic_capture):

@@ -57,7 +57,8 @@ class Frames:
     clipped_states : (N,) in which some pixel is.
     zero : (N, rows, columns) some pixel of the square is cut off at zero; zero_share : (N,) share of the pixels.
     rounding : (N,) variance, counts^2, that rounding gives the mean of all pixels, which more of them do not average.
-    part : (N,) variance of a pixel over that with independent errors of rounding; of_black : (D,) of dark frames.
+    variance_ratio : (N,) variance of a pixel over that with independent errors of rounding; black_variance_ratio : (D,)
+        the same of the dark frames of each exposure.
     """
 
     counts: NDArray[np.float32]
@@ -68,8 +69,8 @@ class Frames:
     zero_share: NDArray[np.float64]
     side: int
     rounding: Array
-    part: Array
-    of_black: Array
+    variance_ratio: Array
+    black_variance_ratio: Array
 
 
 def read_frames(
@@ -88,11 +89,11 @@ def read_frames(
         frame = capture.frames(int(k)).astype(np.float32)
         over = split.any_of(frame >= (np.inf if level is None else level))
         under = split.any_of((frame <= 0) & has_zero)
-        shift, unsure, part = rounding.of_frame(int(k), frame)
+        shift, unsure, ratio = rounding.of_frame(int(k), frame)
         frame -= correction.black.at(exposure[n])
         planes = split.planes(frame if correction.flat is None else frame / correction.flat.response)
         planes = planes + shift.astype(np.float32)[:, None, None] if shift.any() else planes
-        of_rounding.append((unsure.max(), part.mean()))
+        of_rounding.append((unsure.max(), ratio.mean()))
         side = _side(len(states) * len(planes), *planes.shape[1:])
         tops.append(float(planes.max(initial=-np.inf, where=np.isfinite(planes))))
         share[n] = under.mean()
@@ -109,8 +110,8 @@ def read_frames(
         zero_share=share,
         side=side,
         rounding=np.array(of_rounding)[:, 0],
-        part=np.array(of_rounding)[:, 1],
-        of_black=rounding.of_black[:, 3].mean(axis=1),
+        variance_ratio=np.array(of_rounding)[:, 1],
+        black_variance_ratio=rounding.of_black[:, 3].mean(axis=1),
     )
 
 
@@ -219,11 +220,11 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     if noise is not None:
         excess = correction.black.excess(noise, capture.column("exposure_s")[states])
         slope, floor = noise.slope / repeats / top, noise.averaged_floor(repeats, excess) / top**2
-        slope, floor = slope * frames.part / side**2, floor * frames.part / side**2
+        slope, floor = slope * frames.variance_ratio / side**2, floor * frames.variance_ratio / side**2
         data = replace(data, slope=slope, floor=floor, noise_known=True, noise_source=noise.source)
     stated = capture.sigma
     if noise is not None and stated is None:
-        of_means = correction.black.mean_variance(noise) * frames.of_black
+        of_means = correction.black.mean_variance(noise) * frames.black_variance_ratio
         data = without_noise_of_darks(data, capture, model, states=states, black=correction.black, variance=of_means)
     if stated is not None:
         floor = (stated[states] / top / side) ** 2

@@ -1,4 +1,8 @@
-"""The error of rounding that all pixels of a frame share, where neither noise nor the image spreads their counts."""
+"""The error of rounding that all pixels of a frame share, where neither noise nor the image spreads their counts.
+
+Source: Widrow and Kollar, Quantization Noise, Cambridge 2008, chapter 4. The mean of rounded numbers differs from that
+of the numbers unless their spread is above about half a step.
+"""
 
 from __future__ import annotations
 
@@ -34,19 +38,19 @@ NOT_NORMAL = 0.2
 def rounded_off(counts: NDArray[np.float32], noise: float, *, image: bool = True) -> tuple[float, float, float]:
     """What rounding does to the counts of a frame.
 
-    The intensities are taken as normal. Their mean and spread follow from the shares of the whole counts; noise that
-    leaves a single one tells the mean to within a part of a count.
+    The intensities before rounding are taken as normal. The share of pixels with each whole count gives their mean and
+    spread. If all pixels have one count, the mean is known to within a part of a count only.
 
     Parameters
     ----------
-    counts : of the pixels of a frame, whole numbers.
+    counts : (P,) whole numbers, one a pixel.
     noise : least standard deviation of the intensities, counts.
     image : whether the counts are of an image, which is not normal.
 
     Returns
     -------
-    shift, variance : what it took from the mean, counts, and the variance of that, counts^2.
-    part : variance of a pixel over that with rounding errors that are independent, `noise`^2 + 1/12.
+    shift : counts to add to the mean of the frame; variance : of that, counts^2.
+    variance_ratio : variance of a pixel, over the `noise`^2 + 1/12 of an independent error of rounding.
     """
     middle = np.round(np.median(counts)) if counts.size else 0.0
     near = counts[np.abs(counts - middle) < NEAR]
@@ -66,7 +70,7 @@ def rounded_off(counts: NDArray[np.float32], noise: float, *, image: bool = True
     shift = float(np.sum(weight * taken))
     variance = float(np.sum(weight * (taken - shift) ** 2))
     of_counts = share @ steps**2 - of_mean**2
-    # What the image spreads is no noise.
+    # The spread of the image is no noise.
     of_pixel = float(np.sum(weight * np.maximum(of_counts - spread[..., 0] ** 2 + noise**2, LEAST**2)))
     return shift, variance + (NOT_NORMAL * shift * image) ** 2, of_pixel / (noise**2 + QUANTIZATION)
 
@@ -76,7 +80,7 @@ class Rounding:
 
     Attributes
     ----------
-    of_black : (D, 4, channels) mean counts, and `rounded_off`, of the dark frames of each exposure.
+    of_black : (D, 4, channels), for each exposure of dark frames: mean counts, shift, variance and variance ratio.
     """
 
     def __init__(self, capture: Capture, planes: Planes, black: Black) -> None:
@@ -92,10 +96,10 @@ class Rounding:
             self.of_black = np.stack([self._of_darks(capture, dark[near == k]) for k in range(len(black.exposure_s))])
 
     def of_frame(self, k: int, frame: NDArray[np.float32]) -> tuple[Array, Array, Array]:
-        """`rounded_off` of the channels of the stored frame of state k above black, (channels,) each."""
+        """Shift, variance and variance ratio, (channels,) each, of the stored frame of state k above black."""
         black = np.tensordot(self._black.weights(self._exposure_s[k])[0], self.of_black, axes=1)
-        _, shift, variance, part = self._of(_some(self._planes(frame)), black[0], self._repeats[k])
-        return shift - black[1], variance + black[2], part
+        _, shift, variance, ratio = self._of(_some(self._planes(frame)), black[0], self._repeats[k])
+        return shift - black[1], variance + black[2], ratio
 
     def _of_darks(self, capture: Capture, states: NDArray[np.int64]) -> Array:
         frames = [_some(self._planes(capture.frames(int(k)).astype(np.float32))) for k in states]
