@@ -137,7 +137,7 @@ def chosen(opened: Capture, query: Any) -> tuple[int, int]:
         raise ProcessError(f"state and channel must be whole numbers ({error})") from error
     state += done if state < 0 else 0
     if not 0 <= state < done or not 0 <= channel < opened.channels:
-        raise ProcessError(f"{opened.path.name} has {done} states done and {opened.channels} channel(s)")
+        raise ProcessError(f"{opened.path.name} has {done} states done; channels: {opened.channels}")
     return state, channel
 
 
