@@ -19,7 +19,7 @@ def facts_of(capture: Capture) -> list[tuple[str, str]]:
         ("Omega", "not stated" if header.omega_deg is None else f"{header.omega_deg:g} degrees"),
         ("states", f"{done}: {roles}" if roles else done),
         ("exposure", _exposure(capture)),
-        ("frame", f"{columns} x {rows}, {capture.channels} channel{'s' if capture.channels > 1 else ''}, {capture.dtype}"),
+        ("frame", f"{columns} x {rows}, channels: {capture.channels}, {capture.dtype}"),
     ]
 
 
