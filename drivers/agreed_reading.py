@@ -52,15 +52,15 @@ class AgreeingReadings:
     ) -> tuple[float, bool]:
         disturbed = self._clock.now_s() - self._disturbed_s < _MEMORY_S
         alike = _DISTURBED if disturbed else _CALM
-        seen, moving = [read()], 0
-        while len(seen) < _TRIES * (alike - 1):
-            seen.append(read())
-            if len(seen) >= alike and len(set(seen[-alike:])) == 1:
-                return seen[-1], True
-            if seen[-1] == seen[-2]:
+        readings, moving = [read()], 0
+        while len(readings) < _TRIES * (alike - 1):
+            readings.append(read())
+            if len(readings) >= alike and len(set(readings[-alike:])) == 1:
+                return readings[-1], True
+            if readings[-1] == readings[-2]:
                 continue
             # A servo trembles within the tolerance, and so can a changed last digit: the middle is right.
-            window = sorted(seen[-2 * alike + 1 :])
+            window = sorted(readings[-2 * alike + 1 :])
             middle = window[len(window) // 2]
             if len(window) == 2 * alike - 1 and window[-1] - window[0] <= tolerance:
                 return middle, True
@@ -68,11 +68,11 @@ class AgreeingReadings:
             moving = moving + 1 if is_moving() else 0
             if moving == 3:
                 return middle, False
-            if moving == 0 and abs(seen[-1] - seen[-2]) > tolerance:
+            if moving == 0 and abs(readings[-1] - readings[-2]) > tolerance:
                 self._disturbed_s = self._clock.now_s()
                 alike = _DISTURBED
         raise ReplyError(
             asked,
-            f"readings at rest that contradict each other: {seen}",
+            f"readings at rest that contradict each other: {readings}",
             "The line is disturbed: check cable, grounding and baud rate",
         )

@@ -30,10 +30,10 @@ def counts_of(
         The counts contradict `bits` and `shift` of the rig file.
     """
     pixels = fmt.decode(arrival.memory, *size, shift=shift)
-    if found := fmt.misalignment(arrival.memory, pixels, bits, shift):
+    if misalignment := fmt.misalignment(arrival.memory, pixels, bits, shift):
         raise UnknownPixelFormat(
             f"{camera}, {fmt.name} with bits {bits} and shift {shift}",
-            found,
+            misalignment,
             "Correct `bits` and `shift` in the rig file; the camera's manual says how it aligns its data",
         )
     pixels.flags.writeable = False

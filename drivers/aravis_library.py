@@ -106,18 +106,18 @@ def open_camera(name: str, device: str | None, aravis: Any, glib_error: Any) -> 
 
 
 def _find(name: str, device: str | None, aravis: Any) -> str:
-    found = list_cameras(aravis)
-    matching = [c for c in found if device is None or device in (c["id"], c["serial_number"], c["address"])]
-    if len(matching) != 1:
-        raise _not_found(name, device, found, "")
-    return matching[0]["id"]
+    cameras = list_cameras(aravis)
+    matches = [c for c in cameras if device is None or device in (c["id"], c["serial_number"], c["address"])]
+    if len(matches) != 1:
+        raise _not_found(name, device, cameras, "")
+    return matches[0]["id"]
 
 
 def _not_found(name: str, device: str | None, found: list[dict[str, str]], detail: str) -> CameraNotFound:
-    seen = ", ".join(f"{c['id']} (serial {c['serial_number']}, at {c['address']})" for c in found) or "no camera"
+    listing = ", ".join(f"{c['id']} (serial {c['serial_number']}, at {c['address']})" for c in found) or "no camera"
     return CameraNotFound(
         f"open camera {name} ({device or 'the only one'})",
-        f"found {seen}" + (f"; {detail}" if detail else ""),
+        f"found {listing}" + (f"; {detail}" if detail else ""),
         "Check power and cable, and that the interface is in the camera's subnet"
         if not found
         else "Set `device` in the rig file to one of those",

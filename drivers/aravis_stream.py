@@ -113,8 +113,8 @@ class FrameStream:
 
     def counters(self) -> dict[str, int]:
         """Aravis' own counters of this stream, 0 where the transport has no such counter."""
-        known = {self._stream.get_info_name(i) for i in range(self._stream.get_n_infos())}
-        return {name: int(self._stream.get_info_uint64_by_name(name)) if name in known else 0 for name in _COUNTERS}
+        available = {self._stream.get_info_name(i) for i in range(self._stream.get_n_infos())}
+        return {name: int(self._stream.get_info_uint64_by_name(name)) if name in available else 0 for name in _COUNTERS}
 
     def close(self) -> None:
         """Stop the receiving thread; nothing writes to our memory after that."""

@@ -98,10 +98,10 @@ class MotionFailed(DeviceError):
         what_to_do: str = "The axis was sent a stop. Look at the axis before you move it again",
         unit: str = "deg",
     ) -> None:
-        asked = f"axis {axis}, " + ("home" if target_deg is None else f"move to {target_deg:.4f} {unit}")
+        request = f"axis {axis}, " + ("home" if target_deg is None else f"move to {target_deg:.4f} {unit}")
         last = "not known" if last_deg is None else f"{last_deg:.4f} {unit}"
         came_back = f"{why}; last position {last}, after {elapsed_s:.2f} s of {allowed_s:.2f} s allowed"
-        super().__init__(asked, came_back, what_to_do)
+        super().__init__(request, came_back, what_to_do)
         self.axis = axis
         self.target_deg = target_deg
         self.last_deg = last_deg

@@ -116,15 +116,15 @@ class ExposureAndGain:
         if rate is None:
             return
         low, high = features.limits(rate)
-        wanted = 1.0 / (_LONGER * exposure_s + _LONGER_S)
+        rate_hz = 1.0 / (_LONGER * exposure_s + _LONGER_S)
         try:
-            features.set_number((rate,), min(max(wanted, low), high), floor=0.05 * wanted)
+            features.set_number((rate,), min(max(rate_hz, low), high), floor=0.05 * rate_hz)
         except CameraLost:
             raise
         except CameraError as error:
             raise SettingRefused(
                 f"camera {self._name}, set an exposure of {exposure_s:g} s",
-                f"the frame rate limits it and does not take {wanted:.3g} Hz ({error.came_back})",
+                f"the frame rate limits it and does not take {rate_hz:.3g} Hz ({error.came_back})",
                 "Give a shorter exposure_s in the plan",
             ) from error
 
@@ -134,14 +134,14 @@ class ExposureAndGain:
         """Select the gain of all pixels, and let those of taps, colours and the digital part do nothing."""
         features, selector = self._features, "GainSelector"
         entries = features.choices(selector)
-        whole = next((entry for entry in _WHOLE_GAIN if entry in entries), None)
-        if whole is None:
+        overall = next((entry for entry in _WHOLE_GAIN if entry in entries), None)
+        if overall is None:
             return
         for entry in entries:
-            if entry not in _WHOLE_GAIN or (entry == "All" and whole != "All"):
+            if entry not in _WHOLE_GAIN or (entry == "All" and overall != "All"):
                 features.set_choice(selector, entry)
                 self._neutral_gain()
-        features.set_choice(selector, whole)
+        features.set_choice(selector, overall)
 
     def _neutral_gain(self) -> None:
         name = self._features.find((*genicam.GAIN_DB, *genicam.GAIN_RAW))
@@ -218,12 +218,12 @@ class ExposureAndGain:
             return
         if "Manual" in self._features.choices("BslSensorBitDepthMode"):
             self._features.set_choice("BslSensorBitDepthMode", "Manual")
-        known = {bits: entry for entry in self._features.choices(name) if (bits := _bits_in(entry)) is not None}
-        enough = [bits for bits in known if bits >= fmt.bits]
-        if not known or (self.converter_bits() or 0) >= fmt.bits:
+        entry_of_bits = {bits: entry for entry in self._features.choices(name) if (bits := _bits_in(entry)) is not None}
+        enough = [bits for bits in entry_of_bits if bits >= fmt.bits]
+        if not entry_of_bits or (self.converter_bits() or 0) >= fmt.bits:
             return
         try:
-            self._features.set_value(name, known[min(enough) if enough else max(known)])
+            self._features.set_value(name, entry_of_bits[min(enough) if enough else max(entry_of_bits)])
         except CameraLost:
             raise
         except CameraError:
@@ -237,5 +237,5 @@ class ExposureAndGain:
 
 
 def _bits_in(entry: str) -> int | None:
-    found = re.search(r"\d+", entry)
-    return int(found.group()) if found is not None and 6 <= int(found.group()) <= 16 else None
+    match = re.search(r"\d+", entry)
+    return int(match.group()) if match is not None and 6 <= int(match.group()) <= 16 else None

@@ -79,8 +79,8 @@ def _write(path: str) -> None:
     """Append the standard input to a file that has no other name: a link may lead to a file of somebody else."""
     flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
     with open(os.open(path, flags, 0o666), "ab") as file:
-        found = os.fstat(file.fileno())
-        if stat.S_ISREG(found.st_mode) and found.st_nlink == 1:
+        status = os.fstat(file.fileno())
+        if stat.S_ISREG(status.st_mode) and status.st_nlink == 1:
             while text := os.read(0, 1 << 16):
                 # A full disc may have room for a later line.
                 with contextlib.suppress(OSError):

@@ -42,21 +42,21 @@ class MessageDevice:
         self.clock = clock
         # One exchange at a time.
         self.lock = threading.RLock()
-        asked = f"open {port}"
+        action = f"open {port}"
         self._is_held = port.startswith(HELD)
-        others = [who for pid, who in port_holders(port) if pid != os.getpid() and who != f"{held_by} (pid {pid})"]
-        if others:
-            raise PortBusy(asked, f"it is in use by {', '.join(others)}", f"{end_the_holder(port)}; nothing was sent")
+        names = [who for pid, who in port_holders(port) if pid != os.getpid() and who != f"{held_by} (pid {pid})"]
+        if names:
+            raise PortBusy(action, f"it is in use by {', '.join(names)}", f"{end_the_holder(port)}; nothing was sent")
         try:
             if self._is_held:
                 self._file = held_descriptor(port)
             else:
                 self._file = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_CLOEXEC)
         except PermissionError as error:
-            raise PermissionRefused(asked, "this user may not", "Add a udev rule for the instrument") from error
+            raise PermissionRefused(action, "this user may not", "Add a udev rule for the instrument") from error
         except OSError as error:
-            found = ", ".join(str(path) for path in sorted(Path("/dev").glob("usbtmc*"))) or "none"
-            raise PortNotFound(asked, str(error.strerror), f"USBTMC devices found: {found}. Correct `port`") from error
+            ports = ", ".join(str(path) for path in sorted(Path("/dev").glob("usbtmc*"))) or "none"
+            raise PortNotFound(action, str(error.strerror), f"USBTMC devices found: {ports}. Correct `port`") from error
         self._is_usbtmc = Path(os.path.realpath(port)).name.startswith("usbtmc")
         self._buffer = bytearray()
 
@@ -110,5 +110,5 @@ class MessageDevice:
         self._file = -1
 
     def _lost(self, error: OSError) -> PortLost:
-        what = errno.errorcode.get(error.errno or 0, str(error))
-        return PortLost(f"use {self.port}", f"it is gone ({what})", "Check cable and power, then start again")
+        reason = errno.errorcode.get(error.errno or 0, str(error))
+        return PortLost(f"use {self.port}", f"it is gone ({reason})", "Check cable and power, then start again")

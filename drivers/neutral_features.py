@@ -170,8 +170,8 @@ class NeutralFeatures:
         """
         if self._known is None:
             names = self._features.names()
-            found = ((name, rule_for(name)) for name in names)
-            self._known = [(name, rule) for name, rule in found if rule is not None and name not in self._kept]
+            rules = ((name, rule_for(name)) for name in names)
+            self._known = [(name, rule) for name, rule in rules if rule is not None and name not in self._kept]
         if not self._is_loaded:
             self.remarks = list(self._load())
             self._is_loaded = True
@@ -195,8 +195,8 @@ class NeutralFeatures:
                 "Set it in the maker's program, or write it under `features` of the camera in the rig file if the "
                 "frames are right with it",
             )
-        told = set(self.remarks)
-        self.remarks += [text for text, _ in wrong if text not in told]
+        reported = set(self.remarks)
+        self.remarks += [text for text, _ in wrong if text not in reported]
 
     def _load(self) -> Iterator[str]:
         """Load the default user set; yields what is left unknown."""
@@ -209,12 +209,12 @@ class NeutralFeatures:
         for selector, load in _LOADS:
             if features.find((selector,)) is None or features.find((load,)) is None:
                 continue
-            wanted = next((one for one in (self._user_set, *_DEFAULT_SETS) if one in features.choices(selector)), None)
-            if wanted is None:
+            preset = next((key for key in (self._user_set, *_DEFAULT_SETS) if key in features.choices(selector)), None)
+            if preset is None:
                 break
             probe = self._probe()
             try:
-                features.set_choice(selector, wanted)
+                features.set_choice(selector, preset)
                 features.command(load)
             except CameraLost:
                 raise
@@ -222,7 +222,7 @@ class NeutralFeatures:
                 yield from self._unknown(f"the default settings were not loaded ({error.came_back})")
                 return
             if probe is not None and self._value(probe[0]) == probe[1]:
-                yield from self._unknown(f"{load} of {wanted} changed nothing, {probe[0]} stayed as it was")
+                yield from self._unknown(f"{load} of {preset} changed nothing, {probe[0]} stayed as it was")
             return
         yield from self._unknown("this camera has no default settings to load")
 
@@ -233,8 +233,8 @@ class NeutralFeatures:
         now = None if name is None else self._value(name)
         if name is None or not isinstance(now, float):
             return None
-        for wanted in (1.37 * now, 0.73 * now):
-            if self._try(name, float(round(wanted))) and isinstance(back := self._value(name), float) and back != now:
+        for trial_us in (1.37 * now, 0.73 * now):
+            if self._try(name, float(round(trial_us))) and isinstance(back := self._value(name), float) and back != now:
                 return name, back
         return None
 
@@ -251,7 +251,7 @@ class NeutralFeatures:
         """Choose each entry of a feature's selector in turn; once without one."""
         features = self._features
         selector = features.selector_of(name) or next(
-            (known for start, known in _SELECTED_BY.items() if re.fullmatch(start + "(Abs|Raw)?", name)), None
+            (feature for start, feature in _SELECTED_BY.items() if re.fullmatch(start + "(Abs|Raw)?", name)), None
         )
         entries = features.choices(selector) if selector is not None else []
         if selector is None or not entries:
@@ -307,8 +307,8 @@ class NeutralFeatures:
             raise
         except CameraError:
             return None
-        wanted = {"off": 0.0, "least": low, "one": 1.0}[rule.neutral]
-        return min(max(wanted, low), high)
+        neutral = {"off": 0.0, "least": low, "one": 1.0}[rule.neutral]
+        return min(max(neutral, low), high)
 
     def _not_neutral(self) -> Iterator[tuple[str, Rule]]:
         for name, rule in self._known or ():

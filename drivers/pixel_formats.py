@@ -305,12 +305,12 @@ def pixel_format(name_or_code: str | int) -> PixelFormat:
         colour) of cameras, which are not raw intensities.
     """
     code = name_or_code & 0xFFFFFFFF if isinstance(name_or_code, int) else None
-    found = _BY_NAME.get(str(name_or_code)) if code is None else _BY_CODE.get(code)
-    if found is None:
+    known_format = _BY_NAME.get(str(name_or_code)) if code is None else _BY_CODE.get(code)
+    if known_format is None:
         shown = str(name_or_code) if code is None else f"code 0x{code:08x} ({code >> 16 & 0xFF} bits a pixel)"
         raise UnknownPixelFormat(
             f"pixel format {shown}",
             "its layout in memory is not known here",
             "Choose one of " + ", ".join(fmt.name for fmt in PIXEL_FORMATS),
         )
-    return found
+    return known_format

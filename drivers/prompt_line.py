@@ -68,23 +68,23 @@ class PromptLine:
         return int(answer)
 
     def _exchange(self, text: str, reply_s: float, form: re.Pattern[str] | None = None) -> str:
-        asked = f"{self._name}, {text}"
+        request = f"{self._name}, {text}"
         with self._link.lock:
             # What waits here was not asked for now.
             self._link.purge(0.0)
             self._link.write(text.encode("ascii") + b"\r")
             frame = self._link.read_frame(self._link.clock.now_s() + reply_s)
         if frame is None:
-            raise ReplyTimeout(asked, f"no reply in {reply_s:g} s", "Check power, cable and baud rate")
+            raise ReplyTimeout(request, f"no reply in {reply_s:g} s", "Check power, cable and baud rate")
         # The blank behind the prompt of the answer before stands at the front.
         # Terminal servers turn the CR of the box into LF, or into both.
         lines = re.split(r"[\r\n]+", frame.decode("ascii", "replace").lstrip(" \r\n"))
         check = "The line is disturbed: check cable and baud rate"
         if self._echo and lines.pop(0) != text:
-            raise ReplyError(asked, f"the echo of {text!r} is missing in {frame!r}", check)
+            raise ReplyError(request, f"the echo of {text!r} is missing in {frame!r}", check)
         answer = " ".join(line for line in lines if line)
         if "error" in answer.lower() or answer.startswith("CMD_"):
-            raise CommandRejected(asked, answer, "Check the device's model and firmware")
+            raise CommandRejected(request, answer, "Check the device's model and firmware")
         if form is not None and not form.fullmatch(answer):
-            raise ReplyError(asked, f"{answer!r} is no answer to it", check)
+            raise ReplyError(request, f"{answer!r} is no answer to it", check)
         return answer

@@ -32,21 +32,21 @@ def device_kinds(family: Family) -> dict[str, ModuleType]:
         A plug-in offers a kind that exists already, or a module that is none.
     """
     folder = importlib.import_module(f"drivers.{family}")
-    found = {
+    kinds = {
         entry.name: importlib.import_module(f"drivers.{family}.{entry.name}")
         for entry in pkgutil.iter_modules(folder.__path__)
         if not entry.name.startswith("_")
     }
     for plugin in entry_points(group=f"umov.{family}"):
-        if plugin.name in found:
+        if plugin.name in kinds:
             raise ValueError(
                 f"plug-in {plugin.value} offers the kind {plugin.name!r} of {family}, which exists already"
             )
         module = plugin.load()
         if not (hasattr(module, "Config") and hasattr(module, "open")):
             raise ValueError(f"plug-in {plugin.value} for {family} needs a `Config` and a function `open`")
-        found[plugin.name] = module
-    return dict(sorted(found.items()))
+        kinds[plugin.name] = module
+    return dict(sorted(kinds.items()))
 
 
 def open_axis(name: str, config: AxisConfig, lines: LineRegistry) -> MotionAxis:

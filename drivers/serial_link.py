@@ -193,12 +193,12 @@ def agreed(read: Callable[[], T]) -> T:
     ReplyError
         Four readings and no two in a row alike.
     """
-    seen = [read()]
-    while len(seen) < 4:
-        seen.append(read())
-        if seen[-1] == seen[-2]:
-            return seen[-1]
-    raise ReplyError("read a constant twice", f"readings differ: {seen}", "The line is disturbed: check the cable")
+    readings = [read()]
+    while len(readings) < 4:
+        readings.append(read())
+        if readings[-1] == readings[-2]:
+            return readings[-1]
+    raise ReplyError("read a constant twice", f"readings differ: {readings}", "The line is disturbed: check the cable")
 
 
 class PortConfig(Protocol):

@@ -83,16 +83,16 @@ def open_port(
     ------
     PortNotFound, PortBusy, PermissionRefused
     """
-    asked = f"open port {port}"
+    action = f"open port {port}"
     if port.startswith(HELD):
         return HeldPort(port)
     if "://" not in port:
         if not Path(port).exists():
-            raise PortNotFound(asked, "there is no such port", _ports_hint())
+            raise PortNotFound(action, "there is no such port", _ports_hint())
         holders = [(pid, who) for pid, who in port_holders(port) if pid != os.getpid()]
-        others = [who for pid, who in holders if who != f"{held_by} (pid {pid})"]
-        if others:
-            raise PortBusy(asked, f"it is in use by {', '.join(others)}", f"{end_the_holder(port)}; nothing was sent")
+        names = [who for pid, who in holders if who != f"{held_by} (pid {pid})"]
+        if names:
+            raise PortBusy(action, f"it is in use by {', '.join(names)}", f"{end_the_holder(port)}; nothing was sent")
     try:
         options: dict[str, Any] = {} if "://" in port else {"exclusive": True}
         return serial.serial_for_url(
@@ -109,12 +109,12 @@ def open_port(
         number = getattr(error, "errno", None)
         if number in (errno.EACCES, errno.EPERM):
             raise PermissionRefused(
-                asked, f"this user may not; {_owner(port)}", "Join that group and log in again"
+                action, f"this user may not; {_owner(port)}", "Join that group and log in again"
             ) from error
         if number in (errno.EWOULDBLOCK, errno.EAGAIN, errno.EBUSY):
-            named = ", ".join(who for _, who in port_holders(port)) or "a program that this user may not see"
-            raise PortBusy(asked, f"it is in use by {named}", "End that program; nothing was sent") from error
-        raise PortNotFound(asked, str(error), _ports_hint()) from error
+            programs = ", ".join(who for _, who in port_holders(port)) or "a program that this user may not see"
+            raise PortBusy(action, f"it is in use by {programs}", "End that program; nothing was sent") from error
+        raise PortNotFound(action, str(error), _ports_hint()) from error
 
 
 def port_holders(port: str) -> list[tuple[int, str]]:
@@ -122,11 +122,11 @@ def port_holders(port: str) -> list[tuple[int, str]]:
 
     Only processes that this user may look into are seen.
     """
-    wanted = os.path.realpath(port)
+    target = os.path.realpath(port)
     holders = []
     for process in Path("/proc").glob("[0-9]*"):
         try:
-            held = any(os.readlink(entry) == wanted for entry in (process / "fd").iterdir())
+            held = any(os.readlink(entry) == target for entry in (process / "fd").iterdir())
             if held:
                 name = (process / "comm").read_text().strip()
                 holders.append((int(process.name), f"{name} (pid {process.name})"))
@@ -159,5 +159,5 @@ def _ports_hint() -> str:
     # pyserial says "n/a" of what has no description.
     names = [e.device if e.description == "n/a" else f"{e.device} ({e.description})" for e in comports()]
     by_id = sorted(str(path) for path in Path("/dev/serial/by-id").glob("*"))
-    found = ", ".join(names + by_id) or "none"
-    return f"Serial ports found: {found}. Correct `port` in the rig file or plug the device in"
+    ports = ", ".join(names + by_id) or "none"
+    return f"Serial ports found: {ports}. Correct `port` in the rig file or plug the device in"

@@ -29,8 +29,8 @@ class ShutteredSource(PortSource):
 
     def describe(self) -> dict[str, str]:
         """Kind, model and port, what the driver adds, and the model of the shutter."""
-        found = super().describe() | self._facts()
-        return found if self._shutter is None else found | {"shutter": self._shutter.describe()["model"]}
+        description = super().describe() | self._facts()
+        return description if self._shutter is None else description | {"shutter": self._shutter.describe()["model"]}
 
     def _facts(self) -> dict[str, str]:
         return {}

@@ -29,8 +29,8 @@ def check_wavelengths(places: Mapping[float, int], what: str, others: Iterable[f
         first[place] = nm
     for nm in others:
         if nm not in places:
-            known = ", ".join(f"{nm:g}" for nm in places)
-            raise ValueError(f"percent is given for {nm:g} nm, and the wavelengths are {known} nm")
+            listing = ", ".join(f"{nm:g}" for nm in places)
+            raise ValueError(f"percent is given for {nm:g} nm, and the wavelengths are {listing} nm")
 
 
 class LightSource(ABC):

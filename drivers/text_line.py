@@ -32,5 +32,5 @@ class TextLine(ControllerLine):
         ------
         ReplyTimeout, ReplyError
         """
-        asked, question = f"{self.controller} {self.link.port}, {command}", f"{command}{self.end}".encode("ascii")
-        return ask(self.link, question, text_of(form), self.reply_s, asked=asked, what_to_check=self.what_to_check)
+        request, question = f"{self.controller} {self.link.port}, {command}", f"{command}{self.end}".encode("ascii")
+        return ask(self.link, question, text_of(form), self.reply_s, asked=request, what_to_check=self.what_to_check)

@@ -33,7 +33,7 @@ def ask(
     ------
     ReplyTimeout, ReplyError
     """
-    seen: list[bytes] = []
+    frames: list[bytes] = []
     for _ in range(tries):
         with link.lock:
             # What waits here was not asked for now.
@@ -43,10 +43,10 @@ def ask(
             while (frame := link.read_frame(deadline_s)) is not None:
                 if (reply := read(frame)) is not None:
                     return reply
-                seen.append(frame)
+                frames.append(frame)
             link.purge()
-    if seen:
-        raise ReplyError(asked, f"no valid reply, but {seen[:3]}", what_to_check)
+    if frames:
+        raise ReplyError(asked, f"no valid reply, but {frames[:3]}", what_to_check)
     raise ReplyTimeout(asked, f"nothing within {reply_s} s", what_to_check)
 
 

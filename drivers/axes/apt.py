@@ -103,15 +103,15 @@ class APTLine(ControllerLine):
 
         def data_of(frame: bytes) -> bytes | None:
             # All data but the hardware information start with the channel, which is 1.
-            whole = len(frame) == 6 or reply_id == 0x0006 or frame[6:8] == b"\x01\x00"
+            is_reply = len(frame) == 6 or reply_id == 0x0006 or frame[6:8] == b"\x01\x00"
             # A single unit may give another source than its own.
-            whole = whole and (request[4] & 0x7F == UNIT or frame[5] == request[4] & 0x7F)
+            is_reply = is_reply and (request[4] & 0x7F == UNIT or frame[5] == request[4] & 0x7F)
             data = frame[2:4] if len(frame) == 6 else frame[6:]
-            return data if whole and int.from_bytes(frame[:2], "little") == reply_id else None
+            return data if is_reply and int.from_bytes(frame[:2], "little") == reply_id else None
 
-        asked = f"APT {self.link.port}, {REPLY_NAMES.get(reply_id, hex(reply_id))}"
+        title = f"APT {self.link.port}, {REPLY_NAMES.get(reply_id, hex(reply_id))}"
         advice = "Is it an APT unit, and the only program on it? A frozen unit needs its power switched off and on"
-        return ask(self.link, request, data_of, self.reply_s, asked=asked, what_to_check=advice)
+        return ask(self.link, request, data_of, self.reply_s, asked=title, what_to_check=advice)
 
 
 class APTAxis(MotionAxis):
@@ -138,8 +138,8 @@ class APTAxis(MotionAxis):
             bay = config.bay - 1
             # The bay itself, and 1 where it holds a unit.
             if agreed(lambda: line.ask(short_message(0x0060, bay, to=RACK), 0x0061)) != bytes((bay, 1)):
-                asked = f"axis {name}, bay {config.bay} of {model} on {config.port}"
-                raise WrongDevice(asked, "it is empty", "Correct `bay` in the rig file")
+                label = f"axis {name}, bay {config.bay} of {model} on {config.port}"
+                raise WrongDevice(label, "it is empty", "Correct `bay` in the rig file")
         self._unknown = ""
         self._scale = self._find_scale(model, int.from_bytes(info[76:78], "little"))
         self.counts_per_deg = self._scale.position

@@ -117,30 +117,30 @@ class ElliptecLine(ControllerLine):
             The module answered with a status that is an error, or it is busy.
         ReplyTimeout, ReplyError
         """
-        asked = f"Elliptec {self.link.port} address {address}, {command}"
-        seen: list[bytes] = []
+        request = f"Elliptec {self.link.port} address {address}, {command}"
+        frames: list[bytes] = []
         for _ in range(tries):
             with self.link.lock:
                 self.drain()
                 self.send(address, command)
                 deadline_s = self.link.clock.now_s() + self.reply_s
                 while (frame := self.link.read_frame(deadline_s)) is not None:
-                    sender, said, data = _parse(frame)
-                    if self._answers_a_stop(sender, said):
+                    sender, mnemonic, data = _parse(frame)
+                    if self._answers_a_stop(sender, mnemonic):
                         continue
-                    if (sender, said) == (address, letters) and len(data) >= digits:
+                    if (sender, mnemonic) == (address, letters) and len(data) >= digits:
                         return data
-                    if (sender, said) == (address, "GS") and len(data) == 2 and int(data, 16) != 0:
+                    if (sender, mnemonic) == (address, "GS") and len(data) == 2 and int(data, 16) != 0:
                         code = int(data, 16)
                         word = STATUS.get(code, "unknown")
-                        raise CommandRejected(asked, f"status {code}: {word}", "Look at the module")
-                    self._note(sender, said, data)
-                    seen.append(frame)
+                        raise CommandRejected(request, f"status {code}: {word}", "Look at the module")
+                    self._note(sender, mnemonic, data)
+                    frames.append(frame)
                 self.link.purge()
                 self._unanswered_stops.clear()
-        if seen:
-            raise ReplyError(asked, f"no valid reply, but {seen[:3]}", "Check cable, and that addresses differ")
-        raise ReplyTimeout(asked, f"nothing within {self.reply_s} s", "Check power, cable and address")
+        if frames:
+            raise ReplyError(request, f"no valid reply, but {frames[:3]}", "Check cable, and that addresses differ")
+        raise ReplyTimeout(request, f"nothing within {self.reply_s} s", "Check power, cable and address")
 
 
 def _parse(frame: bytes) -> tuple[str, str, str]:
@@ -183,26 +183,26 @@ class ElliptecAxis(SessionReferenceAxis):
 
     def _find(self) -> tuple[str, str]:
         config, line = self.config, self._line
-        found: dict[str, str] = {}
+        modules: dict[str, str] = {}
         for _ in range(2):
             for address in config.address or "0123456789ABCDEF":
                 try:
-                    found[address] = agreed(
+                    modules[address] = agreed(
                         partial(line.ask, address, "in", "IN", 30, tries=2 if config.address else 1)
                     )
                 except ReplyTimeout:
                     if config.address is not None:
                         raise
-            wanted = [item for item in found.items() if config.serial_number in (None, item[1][2:10])]
+            matches = [item for item in modules.items() if config.serial_number in (None, item[1][2:10])]
             # An answer can be late: while the module is missing, all are asked again.
-            if wanted:
+            if matches:
                 break
-        asked = f"axis {self.name}, find Elliptec module on {config.port}"
-        listed = ", ".join(f"address {address}: serial {info[2:10]}" for address, info in found.items()) or "none"
-        if len(wanted) != 1:
+        request = f"axis {self.name}, find Elliptec module on {config.port}"
+        listing = ", ".join(f"address {address}: serial {info[2:10]}" for address, info in modules.items()) or "none"
+        if len(matches) != 1:
             rule = f"address {config.address}, serial_number {config.serial_number}"
-            raise WrongDevice(asked, f"{len(wanted)} modules match {rule}; found {listed}", "Correct the rig file")
-        return wanted[0]
+            raise WrongDevice(request, f"{len(matches)} modules match {rule}; found {listing}", "Correct the rig file")
+        return matches[0]
 
     def _do_read_counts(self) -> int:
         value = int(self._line.ask(self._address, "gp", "PO", 8), 16)

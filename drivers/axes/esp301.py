@@ -76,9 +76,9 @@ class ESP301Line(ControllerLine):
         ------
         ReplyTimeout, ReplyError
         """
-        asked, check = f"ESP301 {self.link.port}, {command}", "Check power, cable, baud rate and RTS/CTS"
+        request, advice = f"ESP301 {self.link.port}, {command}", "Check power, cable, baud rate and RTS/CTS"
         return ask(
-            self.link, f"{command}\r".encode("ascii"), text_of(form), self.reply_s, asked=asked, what_to_check=check
+            self.link, f"{command}\r".encode("ascii"), text_of(form), self.reply_s, asked=request, what_to_check=advice
         )
 
     def take_errors(self, axis: int) -> list[int]:
@@ -104,16 +104,16 @@ class ESP301Axis(SessionReferenceAxis):
         self._line, self._lines = line, lines
         version = line.ask("VE?", _VERSION)
         stage = line.ask(f"{config.axis}ID?", _TEXT)
-        asked = f"axis {name} on {config.port} axis {config.axis}"
+        label = f"axis {name} on {config.port} axis {config.axis}"
         if config.stage_id is not None and not stage.startswith(config.stage_id):
-            raise WrongDevice(f"{asked}, stage {config.stage_id}", f"found {stage!r}", "Correct it in the rig file")
+            raise WrongDevice(f"{label}, stage {config.stage_id}", f"found {stage!r}", "Correct it in the rig file")
         unit = int(line.ask(f"{config.axis}SN?", _INTEGER))
         if unit != DEGREE:
-            raise WrongDevice(f"{asked}, unit", f"unit {unit}, not {DEGREE} (degree)", "Set it with the front panel")
+            raise WrongDevice(f"{label}, unit", f"unit {unit}, not {DEGREE} (degree)", "Set it with the front panel")
         self.speed_deg_s = self._constant("VA?")
         self.acceleration_deg_s2 = self._constant("AC?")
         if self.speed_deg_s <= 0 or self.acceleration_deg_s2 <= 0:
-            raise ReplyError(f"{asked}, speed", f"{self.speed_deg_s}, {self.acceleration_deg_s2}", "Set VA and AC")
+            raise ReplyError(f"{label}, speed", f"{self.speed_deg_s}, {self.acceleration_deg_s2}", "Set VA and AC")
         self._device_min_deg = self._limit("SL?")
         self._device_max_deg = self._limit("SR?")
         model, _, serial_number = stage.partition(",")
@@ -134,11 +134,11 @@ class ESP301Axis(SessionReferenceAxis):
         return stage_limit(self._constant(command))
 
     def _raise_errors(self, asked: str) -> None:
-        own = self._line.take_errors(self.config.axis)
-        if own:
+        codes = self._line.take_errors(self.config.axis)
+        if codes:
             words = [
                 f"error {code}: {(AXIS_ERRORS.get(code % 100) if code >= 100 else ERRORS.get(code)) or 'see manual'}"
-                for code in own
+                for code in codes
             ]
             self._give_up_homing()
             raise CommandRejected(f"axis {self.name}, {asked}", ", ".join(words), "Look at the controller's display")

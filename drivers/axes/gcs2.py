@@ -64,13 +64,13 @@ class GCS2Line(ControllerLine):
         ------
         ReplyTimeout, ReplyError
         """
-        asked = f"GCS2 {self.link.port}, {command!r}"
+        request = f"GCS2 {self.link.port}, {command!r}"
         return ask(
             self.link,
             _bytes(command),
             text_of(form),
             self.reply_s,
-            asked=asked,
+            asked=request,
             what_to_check="Check power, cable and baud rate",
         )
 
@@ -103,18 +103,18 @@ class GCS2Axis(MotionAxis):
         self._line, self._lines = line, lines
         self._answer = re.compile(rf"{config.axis}=([+-]?\d+\.?\d*(?:[eE][+-]?\d+)?)")
         maker, model, serial_number, firmware = read_identity(line.ask("*IDN?", _IDENTITY))
-        asked = f"axis {name} on {config.port} axis {config.axis}"
+        label = f"axis {name} on {config.port} axis {config.axis}"
         if "PHYSIK INSTRUMENTE" not in maker.upper():
-            raise WrongDevice(asked, f"{maker} {model} answers", "Correct `port` in the rig file")
+            raise WrongDevice(label, f"{maker} {model} answers", "Correct `port` in the rig file")
         if config.serial_number is not None and not serial_number:
             raise WrongDevice(
-                asked, f"{model or maker} tells no serial number", "Take serial_number out of the rig file"
+                label, f"{model or maker} tells no serial number", "Take serial_number out of the rig file"
             )
         if config.serial_number not in (None, serial_number):
-            raise WrongDevice(asked, f"{model} has serial number {serial_number}", "Correct it in the rig file")
+            raise WrongDevice(label, f"{model} has serial number {serial_number}", "Correct it in the rig file")
         self.speed_deg_s, self.acceleration_deg_s2 = self._constant("VEL?"), self._constant("ACC?")
         if min(self.speed_deg_s, self.acceleration_deg_s2) <= 0:
-            raise ReplyError(f"{asked}, speed", f"{self.speed_deg_s}, {self.acceleration_deg_s2}", "Set VEL and ACC")
+            raise ReplyError(f"{label}, speed", f"{self.speed_deg_s}, {self.acceleration_deg_s2}", "Set VEL and ACC")
         self._device_min_deg, self._device_max_deg = self._limit("TMN?"), self._limit("TMX?")
         self._identify(model=model, serial_number=serial_number, firmware=firmware, address=str(config.axis))
 
@@ -139,10 +139,10 @@ class GCS2Axis(MotionAxis):
             code = self._take_error()
         if code in (0, STOPPED):
             return
-        asked, words = f"axis {self.name}, {command}", f"error {code}: {ERRORS.get(code, 'see the manual')}"
+        request, words = f"axis {self.name}, {command}", f"error {code}: {ERRORS.get(code, 'see the manual')}"
         if code == NOT_REFERENCED:
-            raise NotHomedError(asked, words, "Home the axis (acquire home)")
-        raise CommandRejected(asked, words, "Look at the state of the controller")
+            raise NotHomedError(request, words, "Home the axis (acquire home)")
+        raise CommandRejected(request, words, "Look at the state of the controller")
 
     def _servo_on(self) -> None:
         if not self._number("SVO?"):

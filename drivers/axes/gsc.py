@@ -65,13 +65,13 @@ class GSCAxis(SessionReferenceAxis):
         super().__init__(name, config, lines.clock)
         self.config: Config = config
         self._line, self._lines = line, lines
-        asked = f"axis {name} on {config.port} axis {config.axis}"
+        label = f"axis {name} on {config.port} axis {config.axis}"
         firmware = line.ask("?:V", _VERSION)
         if config.firmware not in (None, firmware):
-            raise WrongDevice(asked, f"its firmware is {firmware}", "Correct `port` or `firmware` in the rig file")
+            raise WrongDevice(label, f"its firmware is {firmware}", "Correct `port` or `firmware` in the rig file")
         count = len(self._status().pulses)
         if config.axis > count:
-            raise WrongDevice(asked, f"the controller has {count} axes", "Correct `axis` in the rig file")
+            raise WrongDevice(label, f"the controller has {count} axes", "Correct `axis` in the rig file")
         self.counts_per_deg = config.pulses_per_deg
         self.speed_deg_s = config.speed_pps / config.pulses_per_deg
         self.acceleration_deg_s2 = self.speed_deg_s / config.acceleration_s
@@ -86,16 +86,16 @@ class GSCAxis(SessionReferenceAxis):
         )
 
     def _status(self) -> ShotStatus:
-        *pulses, taken, at_limit, busy = self._line.ask("Q:", _STATUS).replace(" ", "").split(",")
-        return ShotStatus([int(text) for text in pulses], taken == "K", at_limit, busy == "B")
+        *pulses, acknowledgement, at_limit, busy = self._line.ask("Q:", _STATUS).replace(" ", "").split(",")
+        return ShotStatus([int(text) for text in pulses], acknowledgement == "K", at_limit, busy == "B")
 
     def _command(self, *commands: str) -> None:
         """Send commands and ask after each whether it was taken; some controllers also answer OK or NG."""
         for command in commands:
             with self._line.link.lock:
                 self._line.send(command)
-                taken = self._status().taken
-            if not taken:
+                is_accepted = self._status().taken
+            if not is_accepted:
                 self._give_up_homing()
                 raise CommandRejected(
                     f"axis {self.name}, {command}", "the controller refuses it", "Is the motor free, or at a limit?"

@@ -43,15 +43,15 @@ class MMCoreAxis(SessionReferenceAxis):
         super().__init__(name, config, lines.clock)
         self.config: Config = config
         self._core = core
-        asked = f"axis {name}, find the stage {config.device}"
+        request = f"axis {name}, find the stage {config.device}"
         if config.device not in core.getLoadedDevices():
-            raise PortNotFound(asked, f"the core holds {loaded_devices(core)}", "Correct `device` or `configuration`")
+            raise PortNotFound(request, f"the core holds {loaded_devices(core)}", "Correct `device` or `configuration`")
         kind = core.getDeviceType(config.device).name
         if kind not in ("Stage", "StageDevice"):
-            raise WrongDevice(asked, f"it is of the type {kind}", "Only stages of one dimension are axes")
+            raise WrongDevice(request, f"it is of the type {kind}", "Only stages of one dimension are axes")
         self.counts_per_deg = config.units_per_deg
         self.speed_deg_s, self.acceleration_deg_s2 = config.speed_deg_s, config.acceleration_deg_s2
-        with asking(asked):
+        with asking(request):
             self._identify(
                 model=f"{core.getDeviceLibrary(config.device)} {core.getDeviceName(config.device)}",
                 serial_number=NOT_TOLD,

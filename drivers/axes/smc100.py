@@ -107,17 +107,17 @@ class SMC100Line(ControllerLine):
         start = f"{address}{command[:2]}"
 
         def value_of(frame: bytes) -> str | None:
-            said = frame.decode("ascii", "replace")
-            behind = said.removeprefix(start).strip()
-            return behind if said.startswith(start) and value.fullmatch(behind) else None
+            reply = frame.decode("ascii", "replace")
+            text = reply.removeprefix(start).strip()
+            return text if reply.startswith(start) and value.fullmatch(text) else None
 
         question = f"{address}{command}\r\n".encode("ascii")
-        asked = f"SMC100 {self.link.port} address {address}, {command}"
+        request = f"SMC100 {self.link.port} address {address}, {command}"
         # Who sets a time asks again by itself.
         tries = 2 if reply_s is None else 1
-        check = "Check power, cable, baud rate, address"
+        advice = "Check power, cable, baud rate, address"
         return ask(
-            self.link, question, value_of, reply_s or self.reply_s, asked=asked, what_to_check=check, tries=tries
+            self.link, question, value_of, reply_s or self.reply_s, asked=request, what_to_check=advice, tries=tries
         )
 
 
@@ -155,7 +155,7 @@ class SMC100Axis(MotionAxis):
         self._device_min_deg = self._constant("SL?")
         self._device_max_deg = self._constant("SR?")
         model, _, firmware = version.rpartition(" ")
-        self._model_is_known = any(known in version.upper() for known in _KNOWN)
+        self._model_is_known = any(name_part in version.upper() for name_part in _KNOWN)
         self._identify(
             model=f"{model or version} stage {stage or 'not told'}",
             serial_number="not told by the protocol",
@@ -199,11 +199,11 @@ class SMC100Axis(MotionAxis):
             letter = self._take_error()
         if letter == "@":
             return
-        asked = f"axis {self.name}, {command}"
+        request = f"axis {self.name}, {command}"
         if letter == "H":
-            raise NotHomedError(asked, f"error H: {ERRORS['H']}", "Home the axis (acquire home)")
+            raise NotHomedError(request, f"error H: {ERRORS['H']}", "Home the axis (acquire home)")
         raise CommandRejected(
-            asked, f"error {letter}: {ERRORS.get(letter, 'unknown')}", "Look at the state of the controller"
+            request, f"error {letter}: {ERRORS.get(letter, 'unknown')}", "Look at the state of the controller"
         )
 
     def _do_read_counts(self) -> float:

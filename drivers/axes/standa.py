@@ -88,24 +88,24 @@ class StandaLine(ControllerLine):
             self._exchange(letters, data)
 
     def _exchange(self, letters: bytes, data: bytes) -> bytes:
-        asked = f"Standa {self.link.port}, {letters.decode('ascii')}"
+        label = f"Standa {self.link.port}, {letters.decode('ascii')}"
         # What waits here was not asked for now.
         self.link.purge(0.0)
         self.link.write(message(letters, data))
-        seen: list[bytes] = []
+        frames: list[bytes] = []
         deadline_s = self.link.clock.now_s() + self.reply_s
         while (frame := self.link.read_frame(deadline_s)) is not None:
             if frame[:4] == letters:
                 return frame
             if frame == WRONG_VALUE:
-                raise CommandRejected(asked, "errv: value out of range", "Check target and settings")
+                raise CommandRejected(label, "errv: value out of range", "Check target and settings")
             # Of the other errors the line may be the cause.
-            seen.append(frame)
+            frames.append(frame)
             if frame in ERRORS:
                 break
-        if seen:
-            raise ReplyError(asked, f"no valid answer, but {[frame[:4] for frame in seen[:3]]}", "Check the cable")
-        raise ReplyTimeout(asked, f"nothing within {self.reply_s} s", "Check power and cable; is it an 8SMC4 or 8SMC5?")
+        if frames:
+            raise ReplyError(label, f"no valid answer, but {[frame[:4] for frame in frames[:3]]}", "Check the cable")
+        raise ReplyTimeout(label, f"nothing within {self.reply_s} s", "Check power and cable; is it an 8SMC4 or 8SMC5?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,17 +135,17 @@ class StandaAxis(SessionReferenceAxis):
         super().__init__(name, config, lines.clock)
         self.config: Config = config
         self._line, self._lines = line, lines
-        asked = f"axis {name} on {config.port}"
+        label = f"axis {name} on {config.port}"
         maker, _, product, *hardware = line.ask(b"geti")
         if maker != b"XIMC":
-            raise WrongDevice(asked, f"maker {maker!r}", "Correct `port` in the rig file")
+            raise WrongDevice(label, f"maker {maker!r}", "Correct `port` in the rig file")
         (serial_number,) = line.ask(b"gser")
         if config.serial_number not in (None, serial_number):
-            raise WrongDevice(asked, f"it has serial number {serial_number}", "Correct it in the rig file")
+            raise WrongDevice(label, f"it has serial number {serial_number}", "Correct it in the rig file")
         (motor, _), (_, feedback, _, _) = line.ask(b"gent"), line.ask(b"gfbs")
         if motor != STEPPER or feedback in COUNTED_BY_ENCODER:
             raise WrongDevice(
-                asked,
+                label,
                 f"motor type {motor}, feedback {feedback}",
                 "Only stepper motors counted in steps are driven here",
             )
@@ -160,7 +160,7 @@ class StandaAxis(SessionReferenceAxis):
         self._home_speed_deg_s = min(fast_home, limit) / config.steps_per_deg
         if min(self.speed_deg_s, self.acceleration_deg_s2, self._home_speed_deg_s) <= 0:
             raise ReplyError(
-                f"{asked}, speed", "speed, acceleration or homing speed is zero", "Load the stage's profile"
+                f"{label}, speed", "speed, acceleration or homing speed is zero", "Load the stage's profile"
             )
         self._read_borders()
         self._identify(
@@ -171,11 +171,11 @@ class StandaAxis(SessionReferenceAxis):
         )
 
     def _read_borders(self) -> None:
-        flags, _, left, micro_left, right, micro_right = self._line.ask(b"geds")
+        flags, _, low, micro_low, high, micro_high = self._line.ask(b"geds")
         if flags & BORDER_IS_A_COUNT and flags & BORDER_STOPS_LEFT:
-            self._device_min_deg = (left + micro_left / self._microsteps) / self.config.steps_per_deg
+            self._device_min_deg = (low + micro_low / self._microsteps) / self.config.steps_per_deg
         if flags & BORDER_IS_A_COUNT and flags & BORDER_STOPS_RIGHT:
-            self._device_max_deg = (right + micro_right / self._microsteps) / self.config.steps_per_deg
+            self._device_max_deg = (high + micro_high / self._microsteps) / self.config.steps_per_deg
 
     def _status(self) -> Status:
         values = self._line.ask(b"gets")

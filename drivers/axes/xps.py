@@ -76,28 +76,28 @@ class XPSLine(ControllerLine):
         ------
         CommandRejected, ReplyTimeout, ReplyError
         """
-        asked = f"XPS {self.link.port}, {call}"
-        whole = text_of(re.compile(rf"0,{form}|{_ERROR}"))
+        label = f"XPS {self.link.port}, {call}"
+        parse = text_of(re.compile(rf"0,{form}|{_ERROR}"))
         answer = ask(
             self.link,
             call.encode("ascii"),
-            whole,
+            parse,
             self.reply_s,
-            asked=asked,
+            asked=label,
             what_to_check="Check power, cable and address",
         )
-        return _values(answer, asked)
+        return _values(answer, label)
 
     def command(self, call: str, reply_s: float | None = None) -> None:
         """Call a function without values, once; raises CommandRejected or ReplyTimeout."""
-        asked = f"XPS {self.link.port}, {call}"
+        label = f"XPS {self.link.port}, {call}"
         with self.link.lock:
             self.link.purge(0.0)
             self.link.write(call.encode("ascii"))
             frame = self.link.read_frame(self.link.clock.now_s() + (reply_s or self.reply_s))
         if frame is None:
-            raise ReplyTimeout(asked, f"nothing within {reply_s or self.reply_s} s", "Check power, cable and address")
-        _values(frame.decode("ascii", "replace"), asked)
+            raise ReplyTimeout(label, f"nothing within {reply_s or self.reply_s} s", "Check power, cable and address")
+        _values(frame.decode("ascii", "replace"), label)
 
 
 def _values(answer: str, asked: str) -> str:
@@ -152,8 +152,8 @@ class XPSAxis(MotionAxis):
             ) from error
 
     def _ask(self, function: str, values: int) -> tuple[float, ...]:
-        wanted = ",".join(["double *"] * values)
-        answer = self._line.ask(f"{function}({self._positioner},{wanted})", ",".join([_NUMBER] * values))
+        placeholders = ",".join(["double *"] * values)
+        answer = self._line.ask(f"{function}({self._positioner},{placeholders})", ",".join([_NUMBER] * values))
         return tuple(float(value) for value in answer.split(","))
 
     def _status(self) -> int:
@@ -189,14 +189,14 @@ class XPSAxis(MotionAxis):
                 "Choose ends that are whole steps apart, the lower one first",
             )
         low_deg, high_deg = sorted(self._to_device_deg(end_deg) for end_deg in (first_deg, last_deg))
-        wanted = (low_deg, high_deg, step_deg)
+        window = (low_deg, high_deg, step_deg)
         self._line.command(
-            f"PositionerPositionCompareSet({self._positioner},{','.join(f'{value:.6f}' for value in wanted)})"
+            f"PositionerPositionCompareSet({self._positioner},{','.join(f'{value:.6f}' for value in window)})"
         )
         # The encoder's resolution rounds them.
-        back, _ = self._read_compare()
-        if any(abs(got - value) > self.config.tolerance_deg for got, value in zip(back, wanted, strict=True)):
-            raise ReplyError(f"axis {self.name}, pulses {wanted}", f"it reads back {back}", "Choose another step")
+        readback, _ = self._read_compare()
+        if any(abs(echo - value) > self.config.tolerance_deg for echo, value in zip(readback, window, strict=True)):
+            raise ReplyError(f"axis {self.name}, pulses {window}", f"it reads back {readback}", "Choose another step")
         self._line.command(f"PositionerPositionCompareEnable({self._positioner})")
 
     def output_no_pulses(self) -> None:
@@ -286,10 +286,10 @@ def open(name: str, config: Config, lines: LineRegistry) -> XPSAxis:
     """Open one axis; reads identity, limits and speed and moves nothing."""
     make = partial(XPSLine, config, lines.clock)
     with lines.taken(config.port, XPSLine, make) as line, contextlib.ExitStack() as failed:
-        own: list[SerialLink] = []
+        links: list[SerialLink] = []
         for _ in range(2):
-            own.append(SerialLink(config.port, 9600, framer, clock=lines.clock))
-            failed.callback(own[-1].close)
-        axis = XPSAxis(name, config, line, lines, moving=own[0], stopping=own[1])
+            links.append(SerialLink(config.port, 9600, framer, clock=lines.clock))
+            failed.callback(links[-1].close)
+        axis = XPSAxis(name, config, line, lines, moving=links[0], stopping=links[1])
         failed.pop_all()
         return axis

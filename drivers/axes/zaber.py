@@ -136,22 +136,22 @@ class ZaberLine(ControllerLine):
         CommandRejected, ReplyTimeout, ReplyError
         """
         with self.link.lock:
-            reply, seen = self._exchange(address, axis, words, tries=2 if repeat else 1)
-        asked = f"Zaber {self.link.port} device {address}, {words or 'status'!r}"
-        if reply is None and seen:
+            reply, frames = self._exchange(address, axis, words, tries=2 if repeat else 1)
+        request = f"Zaber {self.link.port} device {address}, {words or 'status'!r}"
+        if reply is None and frames:
             raise ReplyError(
-                asked, f"no valid reply, but {seen[:3]}", "Check the cable and that every address occurs only once"
+                request, f"no valid reply, but {frames[:3]}", "Check the cable and that every address occurs only once"
             )
         if reply is None:
             raise ReplyTimeout(
-                asked, f"nothing within {self.reply_s} s", "Check power, cable, address and the device's protocol"
+                request, f"nothing within {self.reply_s} s", "Check power, cable, address and the device's protocol"
             )
         if not reply.accepted:
-            raise CommandRejected(asked, f"rejected: {reply.data}", "Check the state of the device and the command")
+            raise CommandRejected(request, f"rejected: {reply.data}", "Check the state of the device and the command")
         return reply
 
     def _exchange(self, address: int, axis: int, words: str, tries: int) -> tuple[Reply | None, list[bytes]]:
-        seen: list[bytes] = []
+        frames: list[bytes] = []
         for _ in range(tries):
             message_id = self.send(address, axis, words)
             deadline_s = self.link.clock.now_s() + self.reply_s
@@ -162,11 +162,11 @@ class ZaberLine(ControllerLine):
                     and (reply.address, reply.axis, reply.message_id) == (address, axis, message_id)
                     and (reply.summed or address in self._unsummed)
                 ):
-                    return reply, seen
+                    return reply, frames
                 # Alerts (!), extra info (#), late replies and noise.
-                seen.append(frame)
+                frames.append(frame)
             self.link.purge()
-        return None, seen
+        return None, frames
 
     def ask_all(self, words: str, quiet_s: float = 0.1) -> list[tuple[int, str]]:
         """Ask every device on the chain; returns addresses and data of the replies until the line is quiet."""
@@ -236,24 +236,24 @@ class ZaberAxis(MotionAxis):
         config = self.config
         # An answer can be late: the chain is as long as it was the last time, and silence is asked once more.
         ask = partial(self._line.ask_all, "get system.serial")
-        found = agreed(ask) or agreed(ask)
-        listed = ", ".join(f"address {address}: serial {serial}" for address, serial in found)
-        asked = f"axis {self.name}, find Zaber device on {config.port}"
-        if not found:
-            raise ReplyTimeout(asked, "no device answers", "Check power, cable and that the chain speaks Zaber ASCII")
-        if len({address for address, _ in found}) < len(found):
-            raise WrongDevice(asked, f"two devices have one address ({listed})", "Renumber the chain")
-        wanted = [
+        devices = agreed(ask) or agreed(ask)
+        listing = ", ".join(f"address {address}: serial {serial}" for address, serial in devices)
+        request = f"axis {self.name}, find Zaber device on {config.port}"
+        if not devices:
+            raise ReplyTimeout(request, "no device answers", "Check power, cable and that the chain speaks Zaber ASCII")
+        if len({address for address, _ in devices}) < len(devices):
+            raise WrongDevice(request, f"two devices have one address ({listing})", "Renumber the chain")
+        matches = [
             (address, serial)
-            for address, serial in found
+            for address, serial in devices
             if config.address in (None, address) and str(config.serial_number or serial) == serial
         ]
-        if len(wanted) != 1:
+        if len(matches) != 1:
             named = {"address": config.address, "serial_number": config.serial_number}
             rule = ", ".join(f"{key} {value}" for key, value in named.items() if value is not None)
-            what = f"no device has {rule}" if rule else f"{len(wanted)} devices answer and the rig file names none"
-            raise WrongDevice(asked, f"{what}; found {listed}", "Correct the rig file or the wiring")
-        return wanted[0]
+            mismatch = f"no device has {rule}" if rule else f"{len(matches)} devices answer and the rig file names none"
+            raise WrongDevice(request, f"{mismatch}; found {listing}", "Correct the rig file or the wiring")
+        return matches[0]
 
     def _ask(self, words: str, *, axis: int | None = None, repeat: bool = True) -> Reply:
         return self._line.ask(self._address, self.config.axis if axis is None else axis, words, repeat=repeat)

@@ -74,14 +74,14 @@ class Monochromator(PortSource):
 
     def select(self, wavelength_nm: float) -> None:
         """Go to a wavelength and read it back; the shutter stays as it is."""
-        asked, (low, high) = f"{self._name}, select {wavelength_nm:g} nm", self.config.range_nm
+        request, (low, high) = f"{self._name}, select {wavelength_nm:g} nm", self.config.range_nm
         if not low <= wavelength_nm <= high:
-            raise DeviceError(asked, f"its range is {low:g} to {high:g} nm", "Correct the plan or `range_nm`")
+            raise DeviceError(request, f"its range is {low:g} to {high:g} nm", "Correct the plan or `range_nm`")
         self._tell(f"GOWAVE {wavelength_nm:.3f}")
         # A late answer to another question is a number as well.
-        back = agreed(lambda: float(self._ask("WAVE?", _NUMBER, self.config.move_s)))
-        if abs(back - wavelength_nm) > self.config.tolerance_nm:
-            raise DeviceError(asked, f"it stands at {back:g} nm", "Look whether its drive is blocked")
+        reading_nm = agreed(lambda: float(self._ask("WAVE?", _NUMBER, self.config.move_s)))
+        if abs(reading_nm - wavelength_nm) > self.config.tolerance_nm:
+            raise DeviceError(request, f"it stands at {reading_nm:g} nm", "Look whether its drive is blocked")
 
     def set_light(self, on: bool) -> None:
         """Open or close the shutter and read it back."""

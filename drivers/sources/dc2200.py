@@ -63,15 +63,15 @@ class Dc2200(PortSource):
     def select(self, wavelength_nm: float) -> None:
         """Choose the LED of a wavelength, and its brightness where the rig file gives one."""
         if wavelength_nm not in self.config.terminals:
-            known = ", ".join(f"{nm:g}" for nm in self.config.terminals)
+            listing = ", ".join(f"{nm:g}" for nm in self.config.terminals)
             raise DeviceError(
-                f"{self._name}, select {wavelength_nm:g} nm", f"its LEDs are {known} nm", "Correct `terminals`"
+                f"{self._name}, select {wavelength_nm:g} nm", f"its LEDs are {listing} nm", "Correct `terminals`"
             )
         on = self.is_on()
         self._selected = self.config.terminals[wavelength_nm]
-        for other in self._used:
-            if other != self._selected:
-                self._switch(other, False)
+        for terminal in self._used:
+            if terminal != self._selected:
+                self._switch(terminal, False)
         if wavelength_nm in self.config.percent:
             self.set_level(self.config.percent[wavelength_nm])
         if on:
@@ -93,21 +93,21 @@ class Dc2200(PortSource):
 
     def set_level(self, percent: float) -> float:
         """Set the brightness of the selected LED; a change of mode shuts it off first."""
-        asked = f"{self._name}, level {percent:g} %"
+        request = f"{self._name}, level {percent:g} %"
         if not 0 <= percent <= 100:
-            raise CommandRejected(asked, "the range is 0 to 100 %", "Correct the level")
+            raise CommandRejected(request, "the range is 0 to 100 %", "Correct the level")
         if self._selected is None:
-            raise DeviceError(asked, "no wavelength was selected", "Select one first")
+            raise DeviceError(request, "no wavelength was selected", "Select one first")
         source = f"SOURce{self._selected}"
         if self._ask(f"{source}:MODe?", _MODE).upper() != "CB":
             self._switch(self._selected, False)
-            self._tell(f"{source}:MODe CB", asked)
-        self._tell(f"{source}:CBRightness:BRIGhtness:AMPLitude {percent:g}", asked)
-        back = float(self._ask(f"{source}:CBRightness:BRIGhtness:AMPLitude?", _NUMBER))
+            self._tell(f"{source}:MODe CB", request)
+        self._tell(f"{source}:CBRightness:BRIGhtness:AMPLitude {percent:g}", request)
+        reading = float(self._ask(f"{source}:CBRightness:BRIGhtness:AMPLitude?", _NUMBER))
         # The box may round to tenths of a percent.
-        if abs(back - percent) > 0.1:
-            raise CommandRejected(asked, f"it reads back {back:g} %", "Look at the box and its LED")
-        return back
+        if abs(reading - percent) > 0.1:
+            raise CommandRejected(request, f"it reads back {reading:g} %", "Look at the box and its LED")
+        return reading
 
     def describe(self) -> dict[str, str]:
         """Kind, model, serial number, firmware and port."""
@@ -120,13 +120,13 @@ class Dc2200(PortSource):
         }
 
     def _switch(self, terminal: int, on: bool) -> None:
-        asked = f"{self._name}, LED {terminal} {'on' if on else 'off'}"
+        request = f"{self._name}, LED {terminal} {'on' if on else 'off'}"
         if self._output(terminal) == on:
             return
         # Sent once: what became of it is read and not assumed.
-        self._tell(f"OUTPut{terminal}:STATe {'ON' if on else 'OFF'}", asked)
+        self._tell(f"OUTPut{terminal}:STATe {'ON' if on else 'OFF'}", request)
         if self._output(terminal) != on:
-            raise CommandRejected(asked, "its output did not follow", "Look at the box and its LED")
+            raise CommandRejected(request, "its output did not follow", "Look at the box and its LED")
 
     def _output(self, terminal: int) -> bool:
         # One changed character must not make light of darkness.
@@ -147,7 +147,7 @@ class Dc2200(PortSource):
 
         An error is read once and would be lost with a garbled answer; what was set is read back as well.
         """
-        seen: list[str] = []
+        answers: list[str] = []
         with self._device.lock:
             for _ in range(2):
                 self._device.drop_input()
@@ -159,11 +159,11 @@ class Dc2200(PortSource):
                         break
                     if form.fullmatch(answer):
                         return answer
-                    seen.append(answer)
-        asked = f"{self._name}, {query}"
-        if seen:
-            raise ReplyError(asked, f"no sense in {seen}", "Check the cable")
-        raise ReplyTimeout(asked, f"no reply in {self.config.reply_s:g} s, twice", "Check power and cable")
+                    answers.append(answer)
+        request = f"{self._name}, {query}"
+        if answers:
+            raise ReplyError(request, f"no sense in {answers}", "Check the cable")
+        raise ReplyTimeout(request, f"no reply in {self.config.reply_s:g} s, twice", "Check power and cable")
 
 
 def open(config: Config, lines: LineRegistry) -> Dc2200:

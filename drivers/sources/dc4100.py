@@ -100,9 +100,9 @@ class Dc4100(PortSource):
         channel = self._channel_of(wavelength_nm)
         on = self.is_on()
         self._selected = channel
-        for other in self._present:
-            if other != channel:
-                self._switch(other, False)
+        for unselected in self._present:
+            if unselected != channel:
+                self._switch(unselected, False)
         if wavelength_nm in self.config.percent:
             self.set_level(self.config.percent[wavelength_nm])
         if on:
@@ -130,22 +130,22 @@ class Dc4100(PortSource):
 
     def set_level(self, percent: float) -> float:
         """Set the brightness of the selected LED, in brightness mode; a change of mode shuts the light off first."""
-        asked = f"LED driver on {self.config.port}, level {percent:g} %"
+        request = f"LED driver on {self.config.port}, level {percent:g} %"
         if not 0 <= percent <= 100:
-            raise CommandRejected(asked, "the range is 0 to 100 %", "Correct the level")
+            raise CommandRejected(request, "the range is 0 to 100 %", "Correct the level")
         if self._selected is None:
-            raise DeviceError(asked, "no wavelength was selected", "Select one first")
+            raise DeviceError(request, "no wavelength was selected", "Select one first")
         if self._digit("M?", "012") != BRIGHTNESS_MODE:
             self.set_light(False)
             self._tell(f"M {BRIGHTNESS_MODE}")
             if self._digit("M?", "012") != BRIGHTNESS_MODE:
-                raise self._refused(asked, "it does not change to brightness mode")
+                raise self._refused(request, "it does not change to brightness mode")
         self._tell(f"BP {self._selected} {percent:g}")
-        back = self._number(f"BP? {self._selected}")
+        reading = self._number(f"BP? {self._selected}")
         # The box may round to whole percents.
-        if abs(back - percent) > 0.5:
-            raise self._refused(asked, f"it reads back {back:g} %")
-        return back
+        if abs(reading - percent) > 0.5:
+            raise self._refused(request, f"it reads back {reading:g} %")
+        return reading
 
     def describe(self) -> dict[str, str]:
         """Kind, model, serial number, firmware, port, and the LEDs by channel with their nominal wavelengths."""
@@ -177,13 +177,13 @@ class Dc4100(PortSource):
         )
 
     def _switch(self, channel: int, on: bool) -> None:
-        asked = f"LED driver on {self.config.port}, LED {channel + 1} {'on' if on else 'off'}"
+        request = f"LED driver on {self.config.port}, LED {channel + 1} {'on' if on else 'off'}"
         if self._output(channel) == on:
             return
         # Sent once: what became of it is read and not assumed.
         self._tell(f"O {channel} {int(on)}")
         if self._output(channel) != on:
-            raise self._refused(asked, "its output did not follow", channel)
+            raise self._refused(request, "its output did not follow", channel)
 
     def _output(self, channel: int) -> bool:
         return self._digit(f"O? {channel}", "01") == 1
@@ -196,11 +196,11 @@ class Dc4100(PortSource):
         reasons = {SUPPLY_FAILS: "its supply is out of range", TOO_HOT: "it is too hot and has shut off all LEDs"}
         if channel is not None:
             reasons[missing_led(channel)] = reasons[open_led(channel)] = "no LED is connected there"
-        found = [text for bit, text in reasons.items() if status & bit]
+        remarks = [text for bit, text in reasons.items() if status & bit]
         error = re.search(r"(-?\d+)\s*:?\s*(.*)", self._ask("E?"))
         if error is not None and int(error[1]) != 0:
-            found.append(f"error {error[1]} {error[2]}".strip())
-        return CommandRejected(asked, "; ".join([came_back, *found]), "Look at the box and its LEDs")
+            remarks.append(f"error {error[1]} {error[2]}".strip())
+        return CommandRejected(asked, "; ".join([came_back, *remarks]), "Look at the box and its LEDs")
 
     # --- wire --------------------------------------------------------------------------------------------
 

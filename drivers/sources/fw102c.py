@@ -66,15 +66,15 @@ class FilterWheel(ShutteredSource):
             raise WrongDevice(
                 f"{self._name}, position {highest}", f"the wheel has {count}", "Correct `positions` in the rig file"
             )
-        here = self._line.ask_number("pos?")
-        self._selected = here if here in config.positions.values() else None
+        position = self._line.ask_number("pos?")
+        self._selected = position if position in config.positions.values() else None
 
     def select(self, wavelength_nm: float) -> None:
         """Turn to the filter of a wavelength; a wheel that stands dark turns there when light is wanted."""
         if wavelength_nm not in self.config.positions:
-            known = ", ".join(f"{nm:g}" for nm in self.config.positions)
+            listing = ", ".join(f"{nm:g}" for nm in self.config.positions)
             raise DeviceError(
-                f"{self._name}, select {wavelength_nm:g} nm", f"its filters are {known} nm", "Correct `positions`"
+                f"{self._name}, select {wavelength_nm:g} nm", f"its filters are {listing} nm", "Correct `positions`"
             )
         dark = self.config.dark_position is not None and not self.is_on()
         self._selected = self.config.positions[wavelength_nm]
@@ -107,11 +107,11 @@ class FilterWheel(ShutteredSource):
             return
         # Answered when the wheel stands there; what became of it is read and not assumed.
         self._line.tell(f"pos={position}", self.config.turn_s)
-        here = self._line.ask_number("pos?")
-        if here != position:
+        reading = self._line.ask_number("pos?")
+        if reading != position:
             raise DeviceError(
                 f"{self._name}, turn to position {position}",
-                f"it stands at {here} after {self.config.turn_s:g} s",
+                f"it stands at {reading} after {self.config.turn_s:g} s",
                 "Look whether the wheel is blocked",
             )
 

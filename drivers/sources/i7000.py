@@ -91,8 +91,8 @@ class RelayModule(PortSource):
             self._link.write(f"{lead}{self.config.address:02X}{command}\r".encode("ascii"))
             frame = self._link.read_frame(self._link.clock.now_s() + self.config.reply_s)
         if frame is None:
-            asked = f"{self._name}, {lead}{command}"
-            raise ReplyTimeout(asked, f"no reply in {self.config.reply_s:g} s", "Check power, cable and address")
+            request = f"{self._name}, {lead}{command}"
+            raise ReplyTimeout(request, f"no reply in {self.config.reply_s:g} s", "Check power, cable and address")
         return frame.decode("ascii", "replace").strip()
 
     def _disturbed(self, asked: str, reply: str) -> ReplyError:

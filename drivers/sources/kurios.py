@@ -61,8 +61,8 @@ class TunableFilter(ShutteredSource):
         if shutter is None and not bands & BLACK:
             raise WrongDevice(f"{self._name}, dark", "it has no band BLACK", "Add a `shutter` to the rig file")
         limits = re.compile(rf"WLmax=({_NUMBER}) WLmin=({_NUMBER})")
-        found = limits.fullmatch(self._line.ask("SP?", limits))
-        self._range_nm = (float(found[2]), float(found[1])) if found else (0.0, 0.0)
+        match = limits.fullmatch(self._line.ask("SP?", limits))
+        self._range_nm = (float(match[2]), float(match[1])) if match else (0.0, 0.0)
 
     def _value(self, keyword: str) -> float:
         form = re.compile(rf"{keyword}=({_NUMBER})")

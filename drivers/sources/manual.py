@@ -44,11 +44,11 @@ class ManualSource(LightSource):
 
     def select(self, wavelength_nm: float) -> None:
         """Ask for another wavelength; not asked again while it is the same."""
-        known = self.config.wavelengths_nm
-        if known and wavelength_nm not in known:
+        wavelengths_nm = self.config.wavelengths_nm
+        if wavelengths_nm and wavelength_nm not in wavelengths_nm:
             raise DeviceError(
                 f"manual source, select {wavelength_nm:g} nm",
-                f"the rig file lists {', '.join(f'{nm:g}' for nm in known)} nm",
+                f"the rig file lists {', '.join(f'{nm:g}' for nm in wavelengths_nm)} nm",
                 "Correct wavelengths_nm in the rig file or the plan",
             )
         if wavelength_nm != self._wavelength_nm:

@@ -41,9 +41,9 @@ class Shutter(PortSource):
 
     def set_light(self, on: bool) -> None:
         """Open or close the blade and wait until `closed?` agrees."""
-        asked = f"shutter on {self.config.port}, {'open' if on else 'close'}"
+        request = f"shutter on {self.config.port}, {'open' if on else 'close'}"
         if on and self.interlock_open():
-            raise CommandRejected(asked, "its interlock is open", "Close the door or the interlock circuit")
+            raise CommandRejected(request, "its interlock is open", "Close the door or the interlock circuit")
         if self._line.ask("mode?") != "1":
             self._line.tell("mode=1")
         # `ens` toggles: it is sent only after a fresh reading and never repeated.
@@ -53,7 +53,7 @@ class Shutter(PortSource):
         while self._flag("closed?") == on:
             if self._link.clock.now_s() > deadline_s:
                 state = "closed" if on else "open"
-                raise DeviceError(asked, f"the blade is still {state} after {self.config.blade_s:g} s", "Look at it")
+                raise DeviceError(request, f"the blade is still {state} after {self.config.blade_s:g} s", "Look at it")
             self._link.clock.sleep_s(0.005)
 
     def is_on(self) -> bool:
