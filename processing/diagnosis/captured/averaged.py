@@ -25,8 +25,8 @@ def side_for(values: int, most: int) -> int:
 def squares(image: NDArray[np.generic], side: int) -> NDArray[np.generic]:
     """Images (..., rows, columns) as (..., rows, side, columns, side); what is left over at the edges goes."""
     height, width = image.shape[-2] // side, image.shape[-1] // side
-    whole = image[..., : height * side, : width * side]
-    return whole.reshape(*image.shape[:-2], height, side, width, side)
+    crop = image[..., : height * side, : width * side]
+    return crop.reshape(*image.shape[:-2], height, side, width, side)
 
 
 def means(images: NDArray[np.float32], side: int) -> NDArray[np.float32]:

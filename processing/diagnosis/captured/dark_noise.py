@@ -84,5 +84,5 @@ def _rows(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -
 
 def _beside(values: Array, light: Array) -> Array:
     """What of values (B, P) of the pixels is neither alike in all of them nor follows their light (K, P)."""
-    known = np.concatenate([np.ones_like(light[:1]), light])
-    return np.asarray(values - (values @ np.linalg.pinv(known)) @ known, dtype=float)
+    basis = np.concatenate([np.ones_like(light[:1]), light])
+    return np.asarray(values - (values @ np.linalg.pinv(basis)) @ basis, dtype=float)

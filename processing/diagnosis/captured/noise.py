@@ -75,12 +75,12 @@ def estimated_noise(data: CaptureData) -> CaptureData:
     rows = y.shape[0]
     keep = min(COMPONENTS, rows - 1, max(picked.size // 4, 1)) if data.sample is None else min(2, rows - 1)
     u, _, _ = np.linalg.svd(y @ y.T)
-    rest = y - u[:, :keep] @ (u[:, :keep].T @ y)
+    residual = y - u[:, :keep] @ (u[:, :keep].T @ y)
     # A row that the components follow closely has less scatter left than its noise.
     share = 1 - np.sum(u[:, :keep] ** 2, axis=1)
     good = share > SMALL if rows > FEW_ROWS else share > 0.0
-    square = rest[good] ** 2 / share[good, None]
-    signal = (y - rest)[good]
+    square = residual[good] ** 2 / share[good, None]
+    signal = (y - residual)[good]
     # Signals that rounding alone sets apart share a level, or it would hang on the processor's order of sums.
     alike = np.round(signal / max(float(np.ptp(signal)), 1e-300), DIGITS)
     edges = np.quantile(alike, np.linspace(0, 1, LEVELS + 1))
@@ -169,20 +169,20 @@ def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
     white = Whitened.of(data, a, looked_at)
     if white.outside.shape[1] < FEWEST_FREE_FOR_NOISE:
         return None
-    rest = white.rest(np.ones(white.y.shape[1], dtype=bool))
+    projector = white.rest(np.ones(white.y.shape[1], dtype=bool))
     floor = np.repeat(data.floor, data.signal.shape[1])[data.row_counts] / white.level**2
-    r, light, dark = np.full((3, len(rest), rows, width), np.nan)
+    r, light, dark = np.full((3, len(projector), rows, width), np.nan)
     good = looked_at[part]
-    r[:, good] = rest @ white.y
-    dark[:, good] = (rest**2 @ floor)[:, None]
-    light[:, good] = rest**2 @ white.variance - dark[:, good]
+    r[:, good] = projector @ white.y
+    dark[:, good] = (projector**2 @ floor)[:, None]
+    light[:, good] = projector**2 @ white.variance - dark[:, good]
     scatter = np.sqrt(_half_square(r, light + dark, NOT_ALIKE_PX, 2)) * white.level.mean()
     if not scatter > ROUNDING * float(np.mean(np.abs(data.signal[..., part, :]))):
         raise CaptureError(
             f"{data.name}: its frames have no noise: neighbouring pixels differ by less than numbers are rounded. "
             "`diagnose` weighs each difference by the noise. Give frames of a camera, or add noise to calculated ones."
         )
-    return replace(_compared(r, light, dark, float(np.trace(rest)) / len(rest)), bent=_of_a_bend(white))
+    return replace(_compared(r, light, dark, float(np.trace(projector)) / len(projector)), bent=_of_a_bend(white))
 
 
 def _of_a_bend(white: Whitened) -> float:
@@ -233,8 +233,8 @@ def _pairs(x: Array, lag: int, axis: int) -> tuple[Array, Array]:
 def _half_square(r: Array, expected: Array, lag: int, axis: int) -> float:
     """Half the square of differences over such a distance, over the variance that is expected."""
     first, second = _pairs(r, lag, axis)
-    one, other = _pairs(expected, lag, axis)
-    return float(np.nansum((first - second) ** 2) / np.nansum(np.where(np.isfinite(first - second), one + other, 0)))
+    v1, v2 = _pairs(expected, lag, axis)
+    return float(np.nansum((first - second) ** 2) / np.nansum(np.where(np.isfinite(first - second), v1 + v2, 0)))
 
 
 def _common(r: Array, expected: Array, axis: int, *, alike: float, free: float) -> float:
@@ -246,13 +246,13 @@ def _common(r: Array, expected: Array, axis: int, *, alike: float, free: float) 
     mean, variance = np.nansum(r, axis=axis) / counts, np.nansum(expected, axis=axis) / counts
     variance[variance == 0] = np.nan
     of_mean = variance / counts * (1 + 2 * max(alike, 0.0))
-    (first, second), (one, other), (its, own) = (_pairs(x, LINES_APART, 1) for x in (mean, variance, of_mean))
-    noise = its + own
-    weight = (one + other) / noise**2
-    told = np.nansum(weight * (one + other))
+    (first, second), (v1, v2), (n1, n2) = (_pairs(x, LINES_APART, 1) for x in (mean, variance, of_mean))
+    noise = n1 + n2
+    weight = (v1 + v2) / noise**2
+    total = np.nansum(weight * (v1 + v2))
     # Every line is in two differences.
-    error = np.sqrt(3 / free * np.nansum((weight * noise) ** 2)) / told
-    common = float(np.nansum(weight * ((first - second) ** 2 - noise)) / told)
+    error = np.sqrt(3 / free * np.nansum((weight * noise) ** 2)) / total
+    common = float(np.nansum(weight * ((first - second) ** 2 - noise)) / total)
     return common if common > NOISE_SURE * error else 0.0
 
 
@@ -262,13 +262,13 @@ def _levels(r: Array, light: Array, dark: Array, free: float) -> tuple[float, fl
     half = (first - second) ** 2 / 2
     used = np.isfinite(half)
     design = np.stack([np.mean(_pairs(x, NOT_ALIKE_PX, 2), axis=0)[used] for x in (light, dark)], axis=1)
-    found = np.ones(2)
+    factors = np.ones(2)
     for _ in range(3):
-        weight = 1 / (design @ np.maximum(found, LEAST_PART)) ** 2
+        weight = 1 / (design @ np.maximum(factors, LEAST_PART)) ** 2
         normal = (design * weight[:, None]).T @ design + WEAK * np.eye(2)
-        found = np.linalg.solve(normal, (design * weight[:, None]).T @ half[used] + WEAK)
+        factors = np.linalg.solve(normal, (design * weight[:, None]).T @ half[used] + WEAK)
     # A difference has the noise of two pixels, and each pixel is in two of them.
-    return float(found[0]), float(found[1]), np.asarray(3 * normal.shape[0] / 2 / free * np.linalg.inv(normal))
+    return float(factors[0]), float(factors[1]), np.asarray(3 * normal.shape[0] / 2 / free * np.linalg.inv(normal))
 
 
 def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
@@ -292,21 +292,21 @@ def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
     level, noise = _dim_levels(y[:, dim], 1 / data.conditions.full_scale)
     if not _alike_in_halves(y[:, dim], mean[dim], outside, 1 / data.conditions.full_scale):
         return None
-    seen, bright = outside.T @ level, outside.T @ y[:, lit].mean(axis=1, dtype=np.float64)
-    if not _is_there(seen, noise, free):
+    black, bright = outside.T @ level, outside.T @ y[:, lit].mean(axis=1, dtype=np.float64)
+    if not _is_there(black, noise, free):
         return None
-    follows, light = float(bright @ seen / (seen @ seen)), float(mean[lit].mean() / max(mean[dim].mean(), 1e-300))
+    slope, light = float(bright @ black / (black @ black)), float(mean[lit].mean() / max(mean[dim].mean(), 1e-300))
     # Nearer to light than to an offset, which bright pixels follow once.
-    if follows**2 > light:
+    if slope**2 > light:
         return None
     along = _courses(data, outside)
-    if np.sum((along.T @ seen) ** 2) > MOSTLY * (seen @ seen):
+    if np.sum((along.T @ black) ** 2) > MOSTLY * (black @ black):
         # A fault, of which to take off a part alone would hide the rest; it may go in steps of whole counts.
-        seen, bright = (v - along @ (along.T @ v) for v in (seen, bright))
-        if not _is_there(seen, noise, free - along.shape[1]):
+        black, bright = (v - along @ (along.T @ v) for v in (black, bright))
+        if not _is_there(black, noise, free - along.shape[1]):
             return None
     offsets = np.zeros(data.values_per_pixel)
-    offsets[rows] = outside @ (seen - bright / light)
+    offsets[rows] = outside @ (black - bright / light)
     return offsets, float(np.sum(offsets**2)) / free
 
 
@@ -318,14 +318,14 @@ def _dim_levels(y: NDArray[np.float32], count: float) -> tuple[Array, float]:
     """
     # Pixels differ in all states alike: that is no noise, though it spreads the counts.
     spread = np.maximum(y.var(axis=1, dtype=np.float64) / count**2 - QUANTIZATION, 0.0)
-    own = y - y.mean(axis=0, dtype=np.float64)
-    middle = np.median(own, axis=1, keepdims=True)
-    scatter = np.median(np.abs(own - middle), axis=1, keepdims=True) / NORMAL_MAD
+    deviation = y - y.mean(axis=0, dtype=np.float64)
+    middle = np.median(deviation, axis=1, keepdims=True)
+    scatter = np.median(np.abs(deviation - middle), axis=1, keepdims=True) / NORMAL_MAD
     reach = OUTSTANDING * np.maximum(scatter, count / 2)
-    kept = np.clip(own, middle - reach, middle + reach)
+    clipped = np.clip(deviation, middle - reach, middle + reach)
     rounding = (count / np.pi) ** 2 / 2 * np.exp(-4 * np.pi**2 * spread)
-    level = kept.mean(axis=1) + y.mean(dtype=np.float64)
-    return level, float(np.mean(kept.var(axis=1) / y.shape[1] + rounding))
+    level = clipped.mean(axis=1) + y.mean(dtype=np.float64)
+    return level, float(np.mean(clipped.var(axis=1) / y.shape[1] + rounding))
 
 
 def _is_there(seen: Array, noise: float, free: int) -> bool:
@@ -348,9 +348,9 @@ def _alike_in_halves(y: NDArray[np.float32], mean: Array, outside: Array, count:
     bright = mean > np.median(mean)
     if bright.all() or not bright.any():
         return True
-    (one, its), (other, noise) = (_dim_levels(y[:, half], count) for half in (bright, ~bright))
-    free, apart = outside.shape[1], outside.T @ (one - other)
-    return bool(apart @ apart < (its + noise) * (free + NOISE_SURE * np.sqrt(2 * free)))
+    (first, v1), (second, v2) = (_dim_levels(y[:, half], count) for half in (bright, ~bright))
+    free, difference = outside.shape[1], outside.T @ (first - second)
+    return bool(difference @ difference < (v1 + v2) * (free + NOISE_SURE * np.sqrt(2 * free)))
 
 
 #: [1] Largest factor on the gain that is tried, and one over the least.
@@ -370,37 +370,37 @@ def checked_noise(data: CaptureData, a: Array) -> CaptureData:
 
     A black level that jitters is taken off, as far as it shows.
     """
-    told: list[str] = []
+    notes: list[str] = []
     jitter = black_jitter(data, a) if data.noise_known else None
     if jitter is not None:
         offsets, variance = jitter
-        told.append(_in_counts("the black level is another one in every frame", variance, data))
+        notes.append(_in_counts("the black level is another one in every frame", variance, data))
         level = offsets.reshape(*data.signal.shape[:2], 1, 1)
         data = replace(data, signal=(data.signal - level).astype(np.float32))
-    found = detector_noise(data, a) if data.noise_known else None
-    if found is None:
-        return replace(data, noise_told=tuple(told))
-    shared = _mixed(found)
+    noise = detector_noise(data, a) if data.noise_known else None
+    if noise is None:
+        return replace(data, noise_told=tuple(notes))
+    shared = _mixed(noise)
     if shared.shown < 1:
-        told.append(
-            f"neighbours share noise (correlation {found.right:.2f} across, {found.down:.2f} down): the images were "
+        notes.append(
+            f"neighbours share noise (correlation {noise.right:.2f} across, {noise.down:.2f} down): the images were "
             f"resampled or smoothed, and of {1 / shared.shown:.1f} pixels one is independent"
         )
-    if found.rows or found.columns:
-        shared = replace(shared, rows=found.rows, columns=found.columns)
+    if noise.rows or noise.columns:
+        shared = replace(shared, rows=noise.rows, columns=noise.columns)
     lines, wide = _lines(shared, data), _wide(shared, data)
     for name, part in zip(("row", "column"), lines, strict=True):
         if part > 0:
-            told.append(_in_counts(f"every {name} of a frame has an offset of its own", part, data))
-    shot, dark = factors = noise_factors(found, shared.shown, data.noise_estimated)
+            notes.append(_in_counts(f"every {name} of a frame has an offset of its own", part, data))
+    shot, dark = factors = noise_factors(noise, shared.shown, data.noise_estimated)
     white = None
     if not data.noise_estimated and factors != (1.0, 1.0):
-        white = _white_in_words(data, found.white / shared.shown, shot, dark)
+        white = _white_in_words(data, noise.white / shared.shown, shot, dark)
     # What is common to a line is a part of the variance of its pixels, and more of that of wide patterns.
     slope, floor = data.slope * shot * wide, (data.floor * dark + sum(lines)) * wide
     data = replace(data, wide=None if np.all(wide == 1) else wide)
     return replace(
-        data, slope=slope, floor=floor, shared=shared, noise_factors=factors, noise_told=tuple(told), white_told=white
+        data, slope=slope, floor=floor, shared=shared, noise_factors=factors, noise_told=tuple(notes), white_told=white
     )
 
 
@@ -442,26 +442,26 @@ def _lines(shared: SharedNoise, data: CaptureData) -> tuple[float, float]:
 
 def noise_factors(found: DetectorNoise, shown: float, estimated: bool) -> tuple[float, float]:
     """Factors on the variance with and without light; one where the images agree with what is declared."""
-    both = np.array([found.shot, found.dark]) / shown
+    factors = np.array([found.shot, found.dark]) / shown
     white = found.white / shown
     inverse = np.asarray(np.linalg.inv(found.covariance / shown**2), dtype=float)
     if estimated:
-        return _balanced(found, white, max(float(both[1]), SMALL))
+        return _balanced(found, white, max(float(factors[1]), SMALL))
     usual = 1.0, 1.0
     bent = found.bent
     least = NOISE_OFF if shown == 1 else NOISE_OFF_MIXED
     far = not min(bent, 1.0) - least < white < max(bent, 1.0) + least
-    if _against(both, usual, inverse) < NOISE_SURE**2 or not (far or _dark_is_off(found, shown)):
+    if _against(factors, usual, inverse) < NOISE_SURE**2 or not (far or _dark_is_off(found, shown)):
         return usual
     # As simple as the images allow: another gain, another read noise, both.
     scales = np.geomspace(1 / MOST_GAIN, MOST_GAIN, GAINS)
-    gain = min(((s, s**2) for s in scales), key=lambda p: _against(both, p, inverse))
+    gain = min(((s, s**2) for s in scales), key=lambda p: _against(factors, p, inverse))
     darks = np.geomspace(LEAST_DARK_FACTOR, MOST_DARK_FACTOR, DARKS)
-    read = min(((1.0, d) for d in darks), key=lambda p: _against(both, p, inverse))
-    simple = min(gain, read, key=lambda p: _against(both, p, inverse))
-    if _against(both, simple, inverse) < SHOWN**2:
+    read = min(((1.0, d) for d in darks), key=lambda p: _against(factors, p, inverse))
+    simple = min(gain, read, key=lambda p: _against(factors, p, inverse))
+    if _against(factors, simple, inverse) < SHOWN**2:
         return float(simple[0]), float(simple[1])
-    return _balanced(found, white, max(float(both[1]), SMALL))
+    return _balanced(found, white, max(float(factors[1]), SMALL))
 
 
 def _against(both: Array, told: tuple[float, float], inverse: Array) -> float:

@@ -136,19 +136,19 @@ def bad_frames(data: CaptureData, a: Array) -> tuple[BadFrame, ...]:
     noise = data.variance_of(good).mean(axis=2).reshape(-1)
     bright = float(np.mean(y**2))
     moments = _Moments(y @ y.T / y.shape[1] / bright, noise * data.noise_known / bright, a, channels)
-    left = [k for k in range(states) if data.row_counts[k * channels]]
-    found: list[BadFrame] = []
-    before = moments.suspect(left)
-    while before is not None and len(found) < MOST_BAD_FRAMES * states:
-        rest = [k for k in left if k != before.state]
-        after = moments.suspect(rest)
+    state_indices = [k for k in range(states) if data.row_counts[k * channels]]
+    bad: list[BadFrame] = []
+    before = moments.suspect(state_indices)
+    while before is not None and len(bad) < MOST_BAD_FRAMES * states:
+        subset = [k for k in state_indices if k != before.state]
+        after = moments.suspect(subset)
         if after is None or before.misfit < LEAST_MISFIT or before.misfit**2 < AGAINST_NEXT * after.misfit**2:
             break
-        if moments.left(rest) > (1 - MOSTLY) * moments.left(left):
+        if moments.left(subset) > (1 - MOSTLY) * moments.left(state_indices):
             break
-        found.append(before)
-        left, before = rest, after
-    return tuple(found) or moments.exchanged(left)
+        bad.append(before)
+        state_indices, before = subset, after
+    return tuple(bad) or moments.exchanged(state_indices)
 
 
 class _Moments:
@@ -201,9 +201,9 @@ class _Moments:
         for i, j in combinations(sorted(worst.tolist()), 2):
             order = where.copy()
             order[[i, j]] = order[[j, i]]
-            left = float(np.sum(p * beyond[np.ix_(order.reshape(-1), order.reshape(-1))]))
-            if left < least:
-                least, pair = left, (i, j)
+            excess = float(np.sum(p * beyond[np.ix_(order.reshape(-1), order.reshape(-1))]))
+            if excess < least:
+                least, pair = excess, (i, j)
         if pair is None:
             return ()
         first, second = (where[k] for k in pair)
@@ -230,28 +230,28 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
     rows = data.values_per_pixel
     good, keep = data.usable & ~data.clipped, data.row_counts
     hits, bad = np.zeros((rows, good.size), dtype=bool), np.zeros(good.shape, dtype=bool)
-    found = Outliers(hits.reshape(data.signal.shape), bad)
+    outliers = Outliers(hits.reshape(data.signal.shape), bad)
     if good.sum() < FEWEST_OF_MANY:
-        return found
+        return outliers
     white = Whitened.of(data, a, good)
     if white.outside.shape[1] < FEWEST_FREE_FOR_HITS:
-        return found
+        return outliers
     # What is struck tells a noise of its own: no state is believed to be far brighter than the usual one of its pixel.
     usual = np.maximum(np.median(white.variance, axis=0), np.float32(DIMMEST))
     share = np.sqrt(np.clip(white.variance / usual, np.float32(DIMMEST), np.float32(BAD_PIXEL)))
     clean = np.ones(white.y.shape[1], dtype=bool)
     # Twice: what was struck is no structure of the image.
     for _ in range(2):
-        rest = white.rest(clean)
+        projector = white.rest(clean)
         # In standard deviations as the image itself shows them: what is declared of the noise is not asked.
-        r = np.asarray(rest.astype(np.float32) @ white.y / np.sqrt(usual), dtype=np.float32)
+        r = np.asarray(projector.astype(np.float32) @ white.y / np.sqrt(usual), dtype=np.float32)
         t = np.asarray(r / share, dtype=np.float32)
-        size = np.sqrt(np.diag(rest))[:, None]
+        size = np.sqrt(np.diag(projector))[:, None]
         scale = (robust_scale(t if clean.all() else t[:, clean]) / size).astype(np.float32)
         noise = np.asarray(share * scale / np.median(scale), dtype=np.float32)
         r /= np.median(scale)
         t /= size.astype(np.float32) * scale
-        struck, noisy = _hits(r, t, noise, rest)
+        struck, noisy = _hits(r, t, noise, projector)
         clean = (np.max(np.abs(t), axis=0) < HIT) & ~struck.any(axis=0)
         if clean.all() or clean.sum() < FEWEST_OF_MANY:
             break
@@ -259,7 +259,7 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
     map_of = np.full(good.shape, float(np.median(noisy)))
     map_of[good] = noisy
     bad[...] = good & _noisier_than_around(map_of, white.outside.shape[1])
-    return found
+    return outliers
 
 
 def _hits(
@@ -274,20 +274,20 @@ def _hits(
     hits = np.zeros(t.shape, dtype=bool)
     noisy = np.asarray(np.mean(t**2, axis=0, dtype=float))
     for p in np.flatnonzero(np.max(np.abs(t), axis=0) > HIT):
-        left, q = r[:, p].astype(float), rest.copy()
+        residual, q = r[:, p].astype(float), rest.copy()
         struck: list[int] = []
-        found: tuple[list[int], float] = ([], float(noisy[p]))
+        selection: tuple[list[int], float] = ([], float(noisy[p]))
         while len(struck) < MOST_STRUCK:
             free = np.maximum(np.diag(q), LEAST_FREE)
             # One hit is strongest where it struck: so it goes with a projection, whatever the noise of each state.
-            k = int(np.argmax(np.abs(left) / np.sqrt(free)))
-            far = abs(left[k]) / np.sqrt(free[k]) / noise[k, p]
-            left, q = left - q[:, k] * left[k] / free[k], q - np.outer(q[:, k], q[k]) / free[k]
+            k = int(np.argmax(np.abs(residual) / np.sqrt(free)))
+            far = abs(residual[k]) / np.sqrt(free[k]) / noise[k, p]
+            residual, q = residual - q[:, k] * residual[k] / free[k], q - np.outer(q[:, k], q[k]) / free[k]
             struck.append(k)
-            square = float(np.sum((left / noise[:, p]) ** 2) / max(np.trace(q), 1.0))
+            square = float(np.sum((residual / noise[:, p]) ** 2) / max(np.trace(q), 1.0))
             if far > HIT * max(np.sqrt(square), 1.0):
-                found = struck.copy(), square
-        hits[found[0], p], noisy[p] = True, found[1]
+                selection = struck.copy(), square
+        hits[selection[0], p], noisy[p] = True, selection[1]
     hits[hits.mean(axis=1) > MOST_HITS] = False
     return hits, noisy
 

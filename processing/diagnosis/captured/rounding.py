@@ -66,9 +66,9 @@ def rounded_off(counts: NDArray[np.float32], noise: float, *, image: bool = True
     weight /= weight.sum()
     # Of counts that are not normal the mean is kept: only what rounding does to a normal one of their spread is added.
     of_mean = share @ steps
-    taken = level[:, 0] - of_mean
-    shift = float(np.sum(weight * taken))
-    variance = float(np.sum(weight * (taken - shift) ** 2))
+    shift_of_level = level[:, 0] - of_mean
+    shift = float(np.sum(weight * shift_of_level))
+    variance = float(np.sum(weight * (shift_of_level - shift) ** 2))
     of_counts = share @ steps**2 - of_mean**2
     # The spread of the image is no noise.
     of_pixel = float(np.sum(weight * np.maximum(of_counts - spread[..., 0] ** 2 + noise**2, LEAST**2)))
@@ -107,12 +107,12 @@ class Rounding:
 
     def _of(self, counts: NDArray[np.float32], black: Array | float, repeats: float, *, image: bool = True) -> Array:
         """Mean of the counts (channels, pixels), and `rounded_off`, (4, channels)."""
-        known = [of_channel[np.isfinite(of_channel)] for of_channel in counts]
-        mean = np.array([of_channel.mean(dtype=float) if of_channel.size else 0.0 for of_channel in known])
+        finite = [of_channel[np.isfinite(of_channel)] for of_channel in counts]
+        mean = np.array([of_channel.mean(dtype=float) if of_channel.size else 0.0 for of_channel in finite])
         if not self._applies:
             return np.stack([mean, 0 * mean, 0 * mean, 0 * mean + 1])
         sd = np.sqrt((self._noise.read + self._noise.slope * np.maximum(mean - black, 0.0)) / repeats)
-        each = [rounded_off(of_channel, float(of), image=image) for of_channel, of in zip(known, sd, strict=True)]
+        each = [rounded_off(of_channel, float(of), image=image) for of_channel, of in zip(finite, sd, strict=True)]
         return np.stack([mean, *np.transpose(each)])
 
 

@@ -69,9 +69,9 @@ def _lost_by_moving(data: CaptureData) -> Array:
 
 def _there_and_back(shift_px: float) -> Array:
     """Weights of 2 `FELT_PX` + 1 neighbours along one axis."""
-    whole = np.convolve(taps(shift_px), taps(-shift_px))
-    middle = whole.size // 2
-    near = whole[middle - FELT_PX : middle + FELT_PX + 1]
+    kernel = np.convolve(taps(shift_px), taps(-shift_px))
+    middle = kernel.size // 2
+    near = kernel[middle - FELT_PX : middle + FELT_PX + 1]
     return np.asarray(near / near.sum())
 
 
@@ -81,10 +81,10 @@ def screened(data: CaptureData, model: InstrumentModel, say: Callable[[str], Non
     `model` is resolved at its wavelength.
     """
     a = rows_of(data, model)
-    found = outliers_of(data, a)
-    hits, bad = np.argwhere(found.hits), np.argwhere(found.bad)
+    outliers = outliers_of(data, a)
+    hits, bad = np.argwhere(outliers.hits), np.argwhere(outliers.bad)
     if len(hits) or len(bad):
-        data = without(data, found)
+        data = without(data, outliers)
         # What was struck is no noise either.
         data = estimated_noise(data) if data.noise_estimated else data
         data = replace(data, left_out=LeftOut(hits=hits, pixels=bad, pitch=data.pitch))

@@ -79,12 +79,12 @@ class _ByEvidence:
         return max(self._seen.values(), key=lambda v: v[0])[2]
 
     def samples(self) -> Samples:
-        seen = sorted(self._seen.values(), key=lambda v: -v[0])
-        weight = np.exp(np.array([v[0] for v in seen]) - seen[0][0])
+        visits = sorted(self._seen.values(), key=lambda v: -v[0])
+        weight = np.exp(np.array([v[0] for v in visits]) - visits[0][0])
         weight /= weight.sum()
-        average = _moments(self._sets, ((w, c, chance) for w, (_, c, _, chance) in zip(weight, seen, strict=True)))
-        there = np.array([v[2].tau > 0 for v in seen])
-        return Samples(*average, there, weight, seen[0][2])
+        average = _moments(self._sets, ((w, c, chance) for w, (_, c, _, chance) in zip(weight, visits, strict=True)))
+        inclusion = np.array([v[2].tau > 0 for v in visits])
+        return Samples(*average, inclusion, weight, visits[0][2])
 
 
 def sample(sets: Sets, state: State, visits: int, seed: int = 0) -> Samples:
@@ -103,12 +103,12 @@ def sample(sets: Sets, state: State, visits: int, seed: int = 0) -> Samples:
             break
         interest = np.maximum(interest, np.minimum(chance, 0.5) * sets.free)
         k = int(random.choice(rate.size, p=rate / rate.sum()))
-        there = random.random() < 0.5
-        state.tau[k] = sets.taus[int(random.choice(sets.taus.size, p=c.tau_weights[k]))] if there else 0.0
+        is_included = random.random() < 0.5
+        state.tau[k] = sets.taus[int(random.choice(sets.taus.size, p=c.tau_weights[k]))] if is_included else 0.0
     # Where what is left is the noise, a set that leaves less has a smaller unit, and must be passed to step by step.
-    for other in swapped(sets, average.best) if sets.noise.known else ():
-        c = sets.conditional(other)
-        average.add(c, other, chance_of(sets, c))
+    for alternative in swapped(sets, average.best) if sets.noise.known else ():
+        c = sets.conditional(alternative)
+        average.add(c, alternative, chance_of(sets, c))
     return average.samples()
 
 
@@ -127,9 +127,9 @@ def swapped(sets: Sets, state: State) -> Iterator[State]:
         c = sets.conditional(without)
         rivals = np.flatnonzero(sets.free & (state.tau == 0) & (c.log_odds > c.log_odds[k] - ALTERNATIVE))
         for j in rivals[np.argsort(-c.log_odds[rivals])][:MOST_RIVALS]:
-            other = without.copy()
-            other.tau[j] = sets.taus[int(np.argmax(c.tau_weights[j]))]
-            yield other
+            alternative = without.copy()
+            alternative.tau[j] = sets.taus[int(np.argmax(c.tau_weights[j]))]
+            yield alternative
 
 
 class ReducedSets:
@@ -151,20 +151,20 @@ class ReducedSets:
         self._out, self._in = _positions(whole, self.certain), _positions(whole, self.kept)
         unit, form = state.unit, whole.form
         prior = [np.full(whole.groups[k].index.size, state.tau[k] ** -2.0) for k in self.certain]
-        own = form.curvature[np.ix_(self._out, self._out)] / unit + np.diag(np.concatenate([np.zeros(0), *prior]))
-        self._covariance = np.linalg.inv(own)
+        block = form.curvature[np.ix_(self._out, self._out)] / unit + np.diag(np.concatenate([np.zeros(0), *prior]))
+        self._covariance = np.linalg.inv(block)
         cross = form.curvature[np.ix_(self._out, self._in)]
         # What is projected out has the mean self._mean + self._turn @ x of all others.
         self._mean = -self._covariance @ form.gradient[self._out] / unit
         self._turn = -self._covariance @ cross / unit
         curvature = form.curvature[np.ix_(self._in, self._in)] + cross.T @ self._turn
-        left = Quadratic(
+        reduced_form = Quadratic(
             float(form.excess + form.gradient[self._out] @ self._mean),
             form.gradient[self._in] + cross.T @ self._mean,
             (curvature + curvature.T) / 2,
         )
-        there = int(np.sum(whole.free[self.certain]))
-        self.sets = whole.among(left, self.kept, _renumbered(whole, self.kept), there)
+        certain_count = int(np.sum(whole.free[self.certain]))
+        self.sets = whole.among(reduced_form, self.kept, _renumbered(whole, self.kept), certain_count)
         self.start = State(state.tau[self.kept].copy(), unit)
 
     def lifted(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
@@ -187,16 +187,16 @@ class ReducedSets:
 
 def _worth(sets: Sets, state: State) -> tuple[NDArray[np.bool_], Array]:
     """Groups (G,) that are certain, and the log odds (G,) of each beside the others or in the place of one."""
-    there = state.tau > 0
-    certain = there & ~sets.free
+    is_included = state.tau > 0
+    certain = is_included & ~sets.free
     reach = sets.conditional(state).log_odds
-    for k in np.flatnonzero(there & sets.free):
+    for k in np.flatnonzero(is_included & sets.free):
         odds = sets.conditional(sets.without(state, int(k))).log_odds
-        instead = np.where(there, -np.inf, odds) - max(odds[k], 0.0)
+        instead = np.where(is_included, -np.inf, odds) - max(odds[k], 0.0)
         reach = np.maximum(reach, instead)
         large = bool(sets.many[k])
         certain[k] = large and odds[k] > CERTAIN and instead.max(initial=-np.inf) < -CERTAIN
-    return certain, np.where(there, np.inf, reach)
+    return certain, np.where(is_included, np.inf, reach)
 
 
 def _positions(sets: Sets, groups: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -259,8 +259,8 @@ class _ByStay:
         """Which groups (S, G) were there in each set, and how much it weighs (S,)."""
         weight: dict[bytes, float] = {}
         for key, share in self._seen.items():
-            there = (np.frombuffer(key) > 0).tobytes()
-            weight[there] = weight.get(there, 0.0) + share
+            inclusion = (np.frombuffer(key) > 0).tobytes()
+            weight[inclusion] = weight.get(inclusion, 0.0) + share
         sets = np.array([np.frombuffer(key, dtype=bool) for key in weight]).reshape(len(weight), -1)
         return sets, np.array(list(weight.values())) / sum(weight.values())
 
@@ -275,11 +275,11 @@ def stay(sets: Sets, state: State, changes: int, seed: int = 0) -> Samples:
     chance, mean, covariance = average.moments()
     probability[reduced.kept] = chance
     inside, weight = average.there()
-    there = np.zeros((len(weight), len(sets.groups)), dtype=bool)
-    there[:, reduced.certain] = True
-    there[:, reduced.kept] = inside
+    inclusion = np.zeros((len(weight), len(sets.groups)), dtype=bool)
+    inclusion[:, reduced.certain] = True
+    inclusion[:, reduced.kept] = inside
     best = reduced.whole_state(average.best[1] if average.best else reduced.start)
-    return Samples(probability, *reduced.lifted(mean, covariance), there, weight, best)
+    return Samples(probability, *reduced.lifted(mean, covariance), inclusion, weight, best)
 
 
 def _starts(sets: Sets, state: State) -> list[tuple[State, float]]:
@@ -288,13 +288,13 @@ def _starts(sets: Sets, state: State) -> list[tuple[State, float]]:
     Of two groups that say the same the chain may never see the second: it would have to pass a set with both or with
     none. One that does what several do would need them all to go at once.
     """
-    there = np.flatnonzero((state.tau > 0) & sets.free)
-    instead = (climb(sets, sets.without(state, int(k)), without=int(k)) for k in there)
+    indices = np.flatnonzero((state.tau > 0) & sets.free)
+    instead = (climb(sets, sets.without(state, int(k)), without=int(k)) for k in indices)
     several = (State(s.tau, state.unit) for s in instead)
     states = {s.tau.tobytes(): s for s in (state, *swapped(sets, state), *several)}.values()
     score = np.array([sets.fitted(s).score for s in states])
     share = np.exp(score - score.max())
     share /= share.sum()
-    kept = [(s, float(w)) for s, w in zip(states, share, strict=True) if w > SHARES]
-    total = sum(w for _, w in kept)
-    return [(s, w / total) for s, w in kept]
+    starts = [(s, float(w)) for s, w in zip(states, share, strict=True) if w > SHARES]
+    total = sum(w for _, w in starts)
+    return [(s, w / total) for s, w in starts]

@@ -261,7 +261,7 @@ def pool(
     indistinguishable effects.
     """
     wavelengths_nm = wavelengths_nm or (0.0,) * len(conditions)
-    found: dict[tuple[str, str, int | None], list[Candidate]] = {}
+    candidates: dict[tuple[str, str, int | None], list[Candidate]] = {}
     fitted = set(model.calibrate)
     one_scale = len({c.full_scale for c in conditions}) == 1
     _check_declared(model)
@@ -274,12 +274,12 @@ def pool(
         for k, condition in enumerate(conditions):
             number = k if belongs == "capture" else None
             for place in effect.places(model, condition):
-                if (effect.kind, place, number) not in found and fitted.isdisjoint(effect.shifts(model, place)):
+                if (effect.kind, place, number) not in candidates and fitted.isdisjoint(effect.shifts(model, place)):
                     parameters = effect.parameters(model, condition, place)
                     price = effect.log_price(model, condition, place)
                     candidate = Candidate(effect, place, parameters, number, price=price)
-                    found[effect.kind, place, number] = _over_wavelengths(candidate, belongs, wavelengths_nm)
-    return tuple(c for each in found.values() for c in each)
+                    candidates[effect.kind, place, number] = _over_wavelengths(candidate, belongs, wavelengths_nm)
+    return tuple(c for each in candidates.values() for c in each)
 
 
 def _over_wavelengths(candidate: Candidate, belongs: Belongs, wavelengths_nm: Sequence[float]) -> list[Candidate]:

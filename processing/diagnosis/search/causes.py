@@ -70,11 +70,11 @@ def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
         odds = found.sets.conditional(found.sets.without(state, k)).log_odds
         least = least_odds(odds[k], left / state.unit)
         rivals = found.sets.free & (state.tau == 0) & (odds > least)
-        others = [int(j) for j in np.argsort(-odds) if rivals[j]]
-        others += [j for j in found.others.get(k, ()) if j not in others]
+        alternatives = [int(j) for j in np.argsort(-odds) if rivals[j]]
+        alternatives += [j for j in found.others.get(k, ()) if j not in alternatives]
         parts = [found.space.slices[m] for m in found.members[k]]
         # From which state on it acts may be open where that it does is certain.
-        members = list(dict.fromkeys([k, *others, *_of_family(found, k)]))
+        members = list(dict.fromkeys([k, *alternatives, *_of_family(found, k)]))
         # The sets that were visited, and the odds beside the likeliest, each err on the sure side.
         total = float(np.logaddexp.reduce(odds[members]))
         out.append(
@@ -84,7 +84,7 @@ def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
                 covariance=tuple(covariance[p, p] for p in parts),
                 probability=min(found.samples.any_of(members), float(probability_at(total))),
                 log_odds=float(odds[k]),
-                alternatives=tuple(found.space.candidates[found.members[j][0]] for j in others),
+                alternatives=tuple(found.space.candidates[found.members[j][0]] for j in alternatives),
             )
         )
     return tuple(sorted(out, key=lambda c: -c.log_odds))
@@ -112,26 +112,26 @@ def _of_family(found: Posterior, k: int) -> list[int]:
 def information(found: Posterior) -> tuple[Array, NDArray[np.int64]]:
     """Information (K,) about each value at its typical size, and which values are nominal ones, which are free."""
     curvature, groups = found.sets.form.curvature, found.sets.groups
-    told = np.diag(curvature).copy()
+    precision = np.diag(curvature).copy()
     always = np.concatenate([np.zeros(0, dtype=np.int64), *(g.index for g in groups if g.fixed_tau is not None)])
     if always.size:
         across = curvature[always]
-        own = across[:, always] + np.eye(always.size) / NOMINAL_TAU**2
-        told -= np.einsum("ij,ij->j", across, np.linalg.solve(own, across))
-    return told, always
+        block = across[:, always] + np.eye(always.size) / NOMINAL_TAU**2
+        precision -= np.einsum("ij,ij->j", across, np.linalg.solve(block, across))
+    return precision, always
 
 
 def would_be_seen(found: Posterior) -> tuple[Candidate, ...]:
     """Effects of optics, source or surface that at a typical size would stand out of the noise, or of what is left."""
-    told, always = information(found)
-    told /= found.samples.best.unit
+    precision, always = information(found)
+    precision /= found.samples.best.unit
     return tuple(
         candidate
         for candidate, part in found.space.pairs
         if not (candidate.state_chosen or candidate.acts_on_counts)
         and not (candidate.effect.varies_over_image or candidate.effect.is_switch or candidate.effect.per_state)
         and not np.isin(part.start, always)
-        and told[part].max() > OUTSTANDING**2
+        and precision[part].max() > OUTSTANDING**2
     )
 
 

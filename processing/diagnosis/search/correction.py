@@ -39,17 +39,17 @@ def _least_needed(found: Posterior, keep: Collection[Candidate]) -> list[int]:
     """
     space, form = found.space, found.sets.form
     order = np.argsort(-found.samples.probability)
-    kept = np.concatenate([np.zeros(0, dtype=bool), *(np.full(c.size, c in keep) for c in space.candidates)])
+    is_used = np.concatenate([np.zeros(0, dtype=bool), *(np.full(c.size, c in keep) for c in space.candidates)])
     mean = found.values / space.joined("typical")
-    told = form.at(mean)
+    chi2_at_mean = form.at(mean)
     out: list[int] = []
     for g in order:
-        left = form.at(np.where(kept, mean, 0.0)) - told
-        if found.samples.probability[g] <= TAKES_PART and left <= SEEN * found.samples.best.unit:
+        loss = form.at(np.where(is_used, mean, 0.0)) - chi2_at_mean
+        if found.samples.probability[g] <= TAKES_PART and loss <= SEEN * found.samples.best.unit:
             break
         out.append(int(g))
         for m in found.members[g]:
-            kept[space.slices[m]] = True
+            is_used[space.slices[m]] = True
     return out
 
 

@@ -87,11 +87,11 @@ def predicted_change(given: Array, mean: Array, covariance: Array, products: Arr
 
     `products` (K, K) of the slopes of what the user reads, averaged.
     """
-    left = max(float(np.sum(products * covariance)), 0.0)
+    variance = max(float(np.sum(products * covariance)), 0.0)
     along, missed = products @ given, mean - given
     size = float(np.sqrt(max(float(given @ along), 0.0)))
     stderr = float(np.sqrt(max(float(along @ covariance @ along), 0.0))) / max(size, 1e-300)
-    before, after = (np.sqrt(left + max(float(v @ products @ v), 0.0)) for v in (mean, missed))
+    before, after = (np.sqrt(variance + max(float(v @ products @ v), 0.0)) for v in (mean, missed))
     return PredictedChange(float(before), float(after), size, float(mean @ along) / max(size, 1e-300), stderr)
 
 
@@ -177,5 +177,5 @@ def in_words(tests: Mapping[str, float]) -> list[str]:
 
 def in_deviations(found: dict[str, tuple[float, float]]) -> tuple[dict[str, float], float]:
     """Tests in standard deviations, of their chi-square beyond noise and its deviation, and the most beyond two."""
-    left = max(chi2 - 2 * deviation for chi2, deviation in found.values())
-    return {k: float(chi2 / deviation) for k, (chi2, deviation) in found.items()}, max(float(left), 0.0)
+    excess = max(chi2 - 2 * deviation for chi2, deviation in found.values())
+    return {k: float(chi2 / deviation) for k, (chi2, deviation) in found.items()}, max(float(excess), 0.0)

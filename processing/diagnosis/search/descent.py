@@ -88,8 +88,8 @@ def improved(
     out = np.where(space.fixed, starts[0], 0.0)
     if positions.size:
         places = [x[positions] for x in starts]
-        left = [problem.sums(part, x, derivatives=False).excess.sum() + weak @ x**2 for x in places]
-        best = places[int(np.argmin(np.nan_to_num(left, nan=np.inf)))]
+        chi2 = [problem.sums(part, x, derivatives=False).excess.sum() + weak @ x**2 for x in places]
+        best = places[int(np.argmin(np.nan_to_num(chi2, nan=np.inf)))]
         out[positions] = minimize(problem, part, best, steps=steps, expansions=0, weak=weak).values
     return out
 
@@ -97,7 +97,7 @@ def improved(
 def minimum_of(problem: Problem, space: Space, sets: Sets, state: State) -> Array:
     """Values (K,) at the minimum of chi-square and prior of one set, from where it is if the problem is linear."""
     fit, on = sets.fitted(state), state.tau > 0
-    part, positions = _part_of(space, [g for g, there in zip(sets.groups, on, strict=True) if there])
+    part, positions = _part_of(space, [g for g, is_on in zip(sets.groups, on, strict=True) if is_on])
     linear, tau = np.zeros(space.size), np.zeros(space.size)
     linear[fit.active] = fit.mean
     for k in np.flatnonzero(on):

@@ -143,14 +143,14 @@ def score(sums: Sums, active: int, new: slice, weak: Array) -> tuple[float, Arra
     """
     g = sums.gradient.sum(axis=0)
     h = sums.curvature.sum(axis=0)
-    left, right = h[new, new], g[new]
+    information, gradient = h[new, new], g[new]
     if active:
         old = h[:active, :active] + np.diag(weak[:active])
         inverse = np.linalg.solve(old, np.column_stack([h[:active, new], g[:active]]))
-        left = left - h[new, :active] @ inverse[:, :-1]
-        right = right - h[new, :active] @ inverse[:, -1]
-    left = (left + left.T) / 2
-    return float(right @ np.linalg.solve(left + np.diag(weak[new]), right)), left
+        information = information - h[new, :active] @ inverse[:, :-1]
+        gradient = gradient - h[new, :active] @ inverse[:, -1]
+    information = (information + information.T) / 2
+    return float(gradient @ np.linalg.solve(information + np.diag(weak[new]), gradient)), information
 
 
 @dataclass(frozen=True)
@@ -207,9 +207,9 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
     total, shares = np.zeros(4), np.zeros((full.sums.shares.shape[0], 4))
     spent = np.zeros(space.size)
     for fold in range(problem.folds):
-        others = [f for f in range(problem.folds) if f != fold]
+        training_folds = [f for f in range(problem.folds) if f != fold]
         least = max(LEAST_GAIN, HELD_OUT_RELATIVE * abs(full.excess))
-        values = minimize(problem, space, full.values, others, least_gain=least, weak=weak).values
+        values = minimize(problem, space, full.values, training_folds, least_gain=least, weak=weak).values
         if local.any():
             start = np.where(local, full.values, values)
             fit = minimize(problem, space, start, [fold], free=local, steps=3)

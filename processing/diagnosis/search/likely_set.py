@@ -23,12 +23,12 @@ def likely_set(sets: Sets, kept: BoolArray | None = None) -> State:
     Also from the groups `kept` (G,) on, in the unit of noise: in that of structure a prior is too stiff for what would
     explain it.
     """
-    found = [climb(sets, sets.empty()), climb(sets, thinned(sets))]
+    states = [climb(sets, sets.empty()), climb(sets, thinned(sets))]
     if kept is not None:
         begin = State(np.where(kept & sets.free, 1.0, sets.empty().tau), sets.noise.floor)
         retune(sets, begin)
-        found.append(climb(sets, begin))
-    return max(found, key=lambda s: sets.fitted(s).score)
+        states.append(climb(sets, begin))
+    return max(states, key=lambda s: sets.fitted(s).score)
 
 
 def climb(sets: Sets, state: State, without: int | None = None) -> State:
@@ -38,13 +38,13 @@ def climb(sets: Sets, state: State, without: int | None = None) -> State:
     best, barred = sets.fitted(state).score, away.copy()
     for _ in range(STEPS):
         c = sets.conditional(state, follow=True)
-        there = state.tau > 0
-        gain = np.where(sets.free & ~barred, np.where(there, -c.log_odds, c.log_odds), -np.inf)
+        is_included = state.tau > 0
+        gain = np.where(sets.free & ~barred, np.where(is_included, -c.log_odds, c.log_odds), -np.inf)
         k = int(np.argmax(gain))
         if gain[k] < -ALTERNATIVE or barred.sum() > PATIENCE:
             break
         tried = state.copy()
-        tried.tau[k] = 0.0 if there[k] else sets.taus[int(np.argmax(c.tau_weights[k]))]
+        tried.tau[k] = 0.0 if is_included[k] else sets.taus[int(np.argmax(c.tau_weights[k]))]
         now = sets.fitted(sets.settled(tried)).score
         if now > best:
             state, best = tried, now
@@ -63,14 +63,14 @@ def everything(sets: Sets) -> State:
 def thinned(sets: Sets) -> State:
     """From everything, the least needed taken away until all are needed; the likeliest of these."""
     state = sets.settled(everything(sets))
-    best, kept = -np.inf, state.copy()
+    best, best_state = -np.inf, state.copy()
     while True:
         c = sets.conditional(state)
         if c.score > best:
-            best, kept = c.score, state.copy()
+            best, best_state = c.score, state.copy()
         odds = np.where((state.tau > 0) & sets.free, c.log_odds, np.inf)
         if odds.min(initial=np.inf) > NEEDED:
-            return kept
+            return best_state
         # Of those that may be there alone one after the other: the last is not impossible any more.
         at_once = 1 if odds.min() < NEVER / 2 else max(1, int(np.sum(odds < 0)) // AT_ONCE)
         worst = np.argsort(odds)[:at_once]
@@ -82,5 +82,5 @@ def thinned(sets: Sets) -> State:
 def retune(sets: Sets, state: State) -> None:
     """Every group at its likeliest variance."""
     c = sets.conditional(state)
-    there = (state.tau > 0) & sets.free
-    state.tau[there] = sets.taus[np.argmax(c.tau_weights[there], axis=1)]
+    is_included = (state.tau > 0) & sets.free
+    state.tau[is_included] = sets.taus[np.argmax(c.tau_weights[is_included], axis=1)]

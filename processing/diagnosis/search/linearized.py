@@ -35,8 +35,8 @@ def noise_of(problem: Problem, sums: Sums) -> Noise:
     if not problem.noise_known:
         # The unit is then the square of what `freedom` was reckoned with, relative to the signal.
         relative = float(sums.square.sum() / max(sums.count.sum(), 1.0)) * freedom
-        left = max(float(sums.excess.sum()) + freedom, 1e-300)
-        return Noise(False, freedom, floor=LEAST_NOISE**2 * left / max(relative, 1e-300))
+        chi2 = max(float(sums.excess.sum()) + freedom, 1e-300)
+        return Noise(False, freedom, floor=LEAST_NOISE**2 * chi2 / max(relative, 1e-300))
     weighty = sum(free * power.sum() ** 2 / float(np.sum(power**2)) for free, power in problem.powers())
     return Noise(True, max(weighty, 1.0), SLACK * deviation_of(freedom, problem.spread))
 
@@ -59,8 +59,8 @@ def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic
     h = sums.curvature.sum(axis=0) * np.outer(typical, typical)
     h = h - np.outer(g, a) - np.outer(a, g) + (excess - freedom) * np.outer(a, a)
     g = g - excess * a
-    told = _told(problem, space, x, h, typical=typical)
-    h, g = h * np.outer(told, told), g * told
+    factors = _told(problem, space, x, h, typical=typical)
+    h, g = h * np.outer(factors, factors), g * factors
     excess, g, h = _whatever(np.sqrt(problem.time_noise(space, x)) / typical, excess, g, h)
     value, vector = np.linalg.eigh(h)
     h = (vector * np.maximum(value, 0.0)) @ vector.T
@@ -71,10 +71,10 @@ def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic
 
 def _whatever(sigma: Array, excess: float, g: Array, h: Array) -> tuple[float, Array, Array]:
     """A form whatever is added to its values (K,), each normal with `sigma` (K,), integrated out."""
-    there = np.flatnonzero(sigma)
-    s, across = sigma[there], h[:, there]
-    own = np.linalg.inv(np.eye(there.size) + across[there] * np.outer(s, s)) * np.outer(s, s)
-    return float(excess - g[there] @ own @ g[there]), g - across @ own @ g[there], h - across @ own @ across.T
+    index = np.flatnonzero(sigma)
+    s, across = sigma[index], h[:, index]
+    cov = np.linalg.inv(np.eye(index.size) + across[index] * np.outer(s, s)) * np.outer(s, s)
+    return float(excess - g[index] @ cov @ g[index]), g - across @ cov @ g[index], h - across @ cov @ across.T
 
 
 def _told(problem: Problem, space: Space, x: Array, h: Array, *, typical: Array) -> Array:

@@ -53,8 +53,8 @@ def with_parts(
             weak = 2 * cause.log_odds * found.samples.best.unit < TIMES * rank**2 * left
         else:
             general = cause.candidates[0].effect.per_state or cause.candidates[0].is_pointwise
-            rest = found.sets.noise.directions if general else 0.0
-            weak = cause.log_odds < max(CERTAIN, TIMES * rest / 2)
+            directions = found.sets.noise.directions if general else 0.0
+            weak = cause.log_odds < max(CERTAIN, TIMES * directions / 2)
         # What the simple form of another cause leaves over is no cause of its own.
         weak |= any(cause.log_odds < o.candidates[0].effect.rough * o.log_odds for o in causes)
         if cause not in out and weak:

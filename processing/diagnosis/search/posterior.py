@@ -100,12 +100,12 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     start : (K,) values to begin with.
     """
     members, groups = grouped(space, fixed)
-    about, sets, state, others = _found(problem, space, fixed, members, groups=groups, start=start)
+    about, sets, state, alternatives = _found(problem, space, fixed, members, groups=groups, start=start)
     # Where what is left is the noise, each set has a unit of its own, and counts by its evidence.
     samples = stay(sets, state, CHANGES) if sets.noise.known else sample(sets, state, SAMPLES)
-    there = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
-    say(f"likely: {', '.join(there) or 'nothing'}; unit of chi-square {state.unit:.3g}")
-    return _posterior_of(problem, space, members, sets, samples=samples, about=about, others=others)
+    labels = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
+    say(f"likely: {', '.join(labels) or 'nothing'}; unit of chi-square {state.unit:.3g}")
+    return _posterior_of(problem, space, members, sets, samples=samples, about=about, others=alternatives)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,18 +156,18 @@ def _found(
     if first.state.unit > BENT or not problem.noise_known:
         # Several large causes, none of which explains much alone, or far from linear: from all of them at once as well.
         begun.append(look(all_at_once(problem, space, fixed, start, noise=first.sets.noise, tau=TAU[-1])))
-        bent = [g for g, own in enumerate(members) if space.candidates[own[0]].effect.has_bent_valley]
+        bent = [g for g, indices in enumerate(members) if space.candidates[indices[0]].effect.has_bent_valley]
         by_itself = [look(alone(problem, space, members[g]), np.arange(len(groups)) == g) for g in bent]
-        begun += [one for one in by_itself if one is not None and one.score > first.score]
+        begun += [trial for trial in by_itself if trial is not None and trial.score > first.score]
     rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
-    ended = [_settled(problem, space, one, look, rounds=rounds) for one in begun if one is not None]
-    last = max(ended, key=lambda one: one.score)
+    ended = [_settled(problem, space, trial, look, rounds=rounds) for trial in begun if trial is not None]
+    last = max(ended, key=lambda trial: trial.score)
     problem.relinearize(space, last.about)
     down = problem.noise_known and last.state.unit <= BENT
-    bends = [g for g, own in enumerate(members) if space.candidates[own[0]].is_pointwise]
+    bends = [g for g, indices in enumerate(members) if space.candidates[indices[0]].is_pointwise]
     # Structure is described by whatever comes nearest to it: what is found beside it is not compared so closely.
-    last, others = _of_bends(problem, space, last, bends if down else (), look=look)
-    return last.about, last.sets, last.state, others
+    last, alternatives = _of_bends(problem, space, last, bends if down else (), look=look)
+    return last.about, last.sets, last.state, alternatives
 
 
 def _of_bends(
@@ -183,17 +183,17 @@ def _of_bends(
         for j in (g for g in bends if found.state.tau[g] == 0):
             state = found.sets.without(found.state, k)
             state.tau[j] = found.state.tau[k]
-            other = look(minimum_of(problem, space, found.sets, found.sets.settled(state)), None)
-            rounds += [other] if other is not None else []
-    best = max(rounds, key=lambda one: one.score)
+            trial = look(minimum_of(problem, space, found.sets, found.sets.settled(state)), None)
+            rounds += [trial] if trial is not None else []
+    best = max(rounds, key=lambda trial: trial.score)
     problem.relinearize(space, best.about)
 
     def there(one: _Round) -> set[int]:
         return {g for g in bends if one.state.tau[g] > 0}
 
     # The noise is that of the light which the first of them tells: it is preferred by more than its evidence.
-    own, likely = there(best), [there(one) for one in rounds if one.score > best.score - CERTAIN]
-    return best, {k: tuple(sorted({j for on in likely if k not in on for j in on - own})) for k in own}
+    best_groups, likely = there(best), [there(trial) for trial in rounds if trial.score > best.score - CERTAIN]
+    return best, {k: tuple(sorted({j for on in likely if k not in on for j in on - best_groups})) for k in best_groups}
 
 
 def _settled(problem: Problem, space: Space, first: _Round, look: Look, *, rounds: int) -> _Round:
@@ -210,8 +210,8 @@ def _settled(problem: Problem, space: Space, first: _Round, look: Look, *, round
         new = look(x, now.state.tau > 0 if now.keeps else None)
         if new is None:
             break
-        noise, told = now.sets.noise, now.sets.form.at(x / space.joined("typical"))
-        if noise.unit(new.excess) <= GROWTH * noise.unit(told):
+        noise, prediction = now.sets.noise, now.sets.form.at(x / space.joined("typical"))
+        if noise.unit(new.excess) <= GROWTH * noise.unit(prediction):
             score = max(score, now.score)
         if new.score < score - ALTERNATIVE:
             break
@@ -232,8 +232,8 @@ def _posterior_of(
 ) -> Posterior:
     """The posterior of a problem linearized `about` values (K,)."""
     typical, values = space.joined("typical"), mean_over_sets(space, samples, np.ones(space.size))
-    there = problem.sums(space, values, derivatives=False)
-    if not sets.noise.unit(there.left(problem.noise_known)) <= GROWTH * sets.noise.unit(sets.form.at(values / typical)):
+    sums = problem.sums(space, values, derivatives=False)
+    if not sets.noise.unit(sums.left(problem.noise_known)) <= GROWTH * sets.noise.unit(sets.form.at(values / typical)):
         # The least certain values lie along a bent valley, in which the straight line to their mean does not stay.
         values = improved(problem, space, sets.groups, samples, starts=[about], steps=2 * STEPS)
     return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical), others)

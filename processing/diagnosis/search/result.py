@@ -371,5 +371,5 @@ class Diagnosis(Section):
 
     def systematic(self) -> tuple[SystematicError, ...]:
         """What an instrument file stores of the uncertainty, also where nothing is corrected; wiring comes first."""
-        told = self.correction.systematic if self.correction is not None else None
-        return () if told is None or self.wiring is not None else (told,)
+        error = self.correction.systematic if self.correction is not None else None
+        return () if error is None or self.wiring is not None else (error,)

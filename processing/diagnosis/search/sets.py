@@ -195,9 +195,9 @@ class Sets:
 
     def _log_prior(self, tau: Array) -> float:
         """Log probability of a set and its variances."""
-        there = self.free & (tau > 0)
-        weight = self.tau_weight[there, np.argmin(np.abs(self.taus[:, None] - tau[there]), axis=0)]
-        return self.log_prior(there) + float(np.log(np.maximum(weight, LEAST_WEIGHT)).sum())
+        is_included = self.free & (tau > 0)
+        weight = self.tau_weight[is_included, np.argmin(np.abs(self.taus[:, None] - tau[is_included]), axis=0)]
+        return self.log_prior(is_included) + float(np.log(np.maximum(weight, LEAST_WEIGHT)).sum())
 
     def log_prior(self, there: NDArray[np.bool_]) -> float:
         """Log probability of a set: how likely a group is is learnt from how many there are (beta-binomial)."""
@@ -208,10 +208,10 @@ class Sets:
 
     def prior_odds(self, there: NDArray[np.bool_]) -> Array:
         """Log odds (G,) of each group to be there, of the prior, given the others of a set."""
-        others = self.beside + there.sum() - there
-        rest = np.maximum((1 + FEW_CAUSES) * self.count - others - 1, FEWEST_ABSENT)
+        other_count = self.beside + there.sum() - there
+        absent_count = np.maximum((1 + FEW_CAUSES) * self.count - other_count - 1, FEWEST_ABSENT)
         beside = np.where(self.alone, (there & self.alone).sum() - (there & self.alone), 0.0)
-        return np.asarray(np.log((1 + others) / rest / self.share) - self.price) + NEVER * beside
+        return np.asarray(np.log((1 + other_count) / absent_count / self.share) - self.price) + NEVER * beside
 
     def fitted(self, state: State) -> Fitted:
         """Posterior of the parameters that are there."""
@@ -235,11 +235,11 @@ class Sets:
         active, prior, lower = self._factored(state)
         inverse = solve_triangular(lower, np.eye(active.size), lower=True) if active.size else lower
         right = inverse @ self.form.gradient[active] / u
-        left = self.form.excess - u * float(right @ right)
+        excess = self.form.excess - u * float(right @ right)
         # What the width of the prior costs: log det (I + T H / u).
         width = 2 * float(np.log(np.diag(lower)).sum()) - float(np.log(prior).sum())
-        score = self.noise.log_likelihood(left) - 0.5 * width + self._log_prior(tau)
-        return Fitted(active, -inverse.T @ right, inverse.T @ inverse, left, score), inverse, right
+        score = self.noise.log_likelihood(excess) - 0.5 * width + self._log_prior(tau)
+        return Fitted(active, -inverse.T @ right, inverse.T @ inverse, excess, score), inverse, right
 
     def conditional(self, state: State, *, follow: bool = False) -> Conditional:
         """Posterior of the parameters that are there, and odds of every group given the others.
@@ -256,20 +256,20 @@ class Sets:
             value = np.maximum(value, 0.0)[:, None]
             along = (vector.transpose(0, 2, 1) @ q[:, :, None])[:, None, :, 0] ** 2
             t2 = (self.taus**2)[:, None]
-            taken = np.sum(t2 * along / (1 + t2 * value), axis=2)
-            gain = 0.5 * (taken - np.sum(np.log1p(t2 * value), axis=2))
+            explained = np.sum(t2 * along / (1 + t2 * value), axis=2)
+            gain = 0.5 * (explained - np.sum(np.log1p(t2 * value), axis=2))
             if follow and (new := state.tau[members] == 0).any():
-                left = fit.left - state.unit * taken[new]
-                wider = np.log1p(t2 * value[new] * (state.unit / self.noise.units(left))[..., None])
-                gain[new] = self.noise.log_likelihoods(left) - now - 0.5 * np.sum(wider, axis=2)
+                excess = fit.left - state.unit * explained[new]
+                wider = np.log1p(t2 * value[new] * (state.unit / self.noise.units(excess))[..., None])
+                gain[new] = self.noise.log_likelihoods(excess) - now - 0.5 * np.sum(wider, axis=2)
             gain += np.log(np.maximum(self.tau_weight[members], LEAST_WEIGHT))
             top = gain.max(axis=1, keepdims=True)
             weights[members] = np.exp(gain - top)
             total = weights[members].sum(axis=1, keepdims=True)
             weights[members] /= total
             log_odds[members] = (top + np.log(total))[:, 0]
-        there = (state.tau > 0) & self.free
-        log_odds = np.where(self.free, log_odds + self.prior_odds(there), np.inf)
+        is_included = (state.tau > 0) & self.free
+        log_odds = np.where(self.free, log_odds + self.prior_odds(is_included), np.inf)
         return Conditional(**vars(fit), log_odds=log_odds, tau_weights=weights)
 
     def _cavities(
@@ -291,9 +291,9 @@ class Sets:
             for k in np.flatnonzero(state.tau[members] > 0):
                 at = where[index[k]]
                 # The posterior of a group that is there is its prior times what the others leave it.
-                own = np.linalg.inv(fit.covariance[np.ix_(at, at)])
-                s[k] = own - np.eye(at.size) * state.tau[members[k]] ** -2.0
-                q[k] = -own @ fit.mean[at]
+                precision = np.linalg.inv(fit.covariance[np.ix_(at, at)])
+                s[k] = precision - np.eye(at.size) * state.tau[members[k]] ** -2.0
+                q[k] = -precision @ fit.mean[at]
             yield members, s, q
 
 
