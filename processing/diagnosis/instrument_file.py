@@ -31,14 +31,14 @@ def extended(model: InstrumentModel, diagnosis: Diagnosis) -> InstrumentModel:
         element, _, field = name.rpartition(".")
         old = model.value_of(name)
         values.setdefault(element, {})[field] = _merged(old or 0.0, entry, diagnosis.wavelengths_nm)
-        known = entry.model_copy(update={"value": entry.stderr or 0.0})
-        errors[name] = _merged(errors.get(name, 0.0), known, diagnosis.wavelengths_nm)
+        error = entry.model_copy(update={"value": entry.stderr or 0.0})
+        errors[name] = _merged(errors.get(name, 0.0), error, diagnosis.wavelengths_nm)
     systematic = diagnosis.systematic()
-    told = [s.wavelength_nm for s in systematic]
+    wavelengths = [s.wavelength_nm for s in systematic]
     update = {
         "stderr": errors,
         "effects": (*model.effects, *diagnosis.applied()),
-        "systematic": (*(s for s in model.systematic if s.wavelength_nm not in told), *systematic),
+        "systematic": (*(s for s in model.systematic if s.wavelength_nm not in wavelengths), *systematic),
     }
     return model.with_values(values).model_copy(update=update)
 
@@ -51,8 +51,8 @@ def _merged(old: Dispersive, entry: EffectParameter, wavelengths_nm: tuple[float
         new = dict.fromkeys(wavelengths_nm, entry.value)
     else:
         new = dict(zip(entry.wavelengths_nm or (), entry.value, strict=True))
-    kept = {} if not isinstance(old, dict) else old
-    return {k: v for k, v in kept.items() if all(abs(k - w) >= SAME_NM for w in new)} | new
+    stored = {} if not isinstance(old, dict) else old
+    return {k: v for k, v in stored.items() if all(abs(k - w) >= SAME_NM for w in new)} | new
 
 
 def file_head(first: str, note: str) -> str:

@@ -43,9 +43,9 @@ def calibrated(problem: InstrumentProblem, found: Posterior, solved: Solution) -
     nominal = {c: p for c, p in solved.base.pairs if c.place}
     for candidate, where in nominal.items():
         covariance = found.covariance[part[candidate], part[candidate]]
-        for one, (fitted,), ((variance,),) in candidate.by_wavelength(solved.fit.values[where], covariance):
+        for single, (fitted,), ((variance,),) in candidate.by_wavelength(solved.fit.values[where], covariance):
             for model, wavelength in zip(problem.models, problem.wavelengths_nm, strict=True):
-                if one.wavelength_nm in (None, wavelength):
+                if single.wavelength_nm in (None, wavelength):
                     start = float(model.value_of(candidate.place))  # type: ignore[arg-type]
                     value = start + float(fitted), float(np.sqrt(max(variance, 0.0)))
                     values.setdefault(candidate.place, {})[wavelength] = value
@@ -97,24 +97,24 @@ def _source_percent(problem: InstrumentProblem, k: int, solved: Solution) -> flo
     """Standard deviation of the level of the source over the states, where channels tell it."""
     if not problem.has_free_level(k):
         return None
-    found = dict(solved.space.pairs)
-    own = [p for c, p in found.items() if c.effect.is_projected and c.capture == k]
-    level = 1 + solved.fit.values[own[0]] if own else None
+    slices = dict(solved.space.pairs)
+    levels = [p for c, p in slices.items() if c.effect.is_projected and c.capture == k]
+    level = 1 + solved.fit.values[levels[0]] if levels else None
     if level is None:
         data, mine = problem.captures[k], solved.space.acting(k, problem.wavelengths_nm[k])
-        seen = problem.predicted(k, problem.changes(k, mine.space, mine.of(solved.fit.values)))
+        expected = problem.predicted(k, problem.changes(k, mine.space, mine.of(solved.fit.values)))
         measured = data.signal[:, :, data.usable].mean(axis=2, dtype=float)
-        level = np.sum(measured * seen, axis=1) / np.sum(seen**2, axis=1)
+        level = np.sum(measured * expected, axis=1) / np.sum(expected**2, axis=1)
     return 100 * float(np.std(level) / np.mean(level))
 
 
 def not_measured(problem: InstrumentProblem) -> tuple[NotMeasured, ...]:
     """Frames, hits and pixels that were left out, as the frames are stored."""
-    told = []
+    entries = []
     for data in problem.captures:
         out = data.left_out
         if out:
-            told.append(
+            entries.append(
                 NotMeasured(
                     capture=data.name,
                     states=tuple(out.frames),
@@ -125,15 +125,15 @@ def not_measured(problem: InstrumentProblem) -> tuple[NotMeasured, ...]:
                     pitch=out.pitch,
                 )
             )
-    return tuple(told)
+    return tuple(entries)
 
 
 def noise_report(problem: InstrumentProblem) -> NoiseReport:
     """Whether the noise is what is declared."""
     several = len(problem.captures) > 1
-    told = tuple(f"{c.name}: {line}" if several else line for c in problem.captures for line in c.told_of_noise)
-    if told:
-        return NoiseReport(verdict="not_as_declared", told=told)
+    lines = tuple(f"{c.name}: {line}" if several else line for c in problem.captures for line in c.told_of_noise)
+    if lines:
+        return NoiseReport(verdict="not_as_declared", told=lines)
     if not problem.noise_known:
         return NoiseReport(verdict="unknown")
     return NoiseReport(verdict="estimated" if any(c.noise_estimated for c in problem.captures) else "as_declared")

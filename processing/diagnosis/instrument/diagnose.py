@@ -54,14 +54,14 @@ class Outcome:
 
 def outcome_of(bench: WholeBench, found: Posterior) -> Outcome:
     """Test what a posterior leaves."""
-    asked = predicts(bench.problem)
+    problem = predicts(bench.problem)
     unfit = bench.as_many_as_intensities(found, SHARES)
-    solved = solution(asked, found, bench.base, bench.base.vector(bench.start), unfit=unfit)
-    captures = range(len(asked.captures))
-    before = tuple(residual(asked, k, solved.base, solved.before_fit) for k in captures)
-    after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
-    left = sum(left_of(asked, r) for r in after)
-    return Outcome(bench, asked, found, solved, before, after, has_structure(asked, after), left)
+    solved = solution(problem, found, bench.base, bench.base.vector(bench.start), unfit=unfit)
+    captures = range(len(problem.captures))
+    before = tuple(residual(problem, k, solved.base, solved.before_fit) for k in captures)
+    after = tuple(residual(problem, k, solved.space, solved.fit) for k in captures)
+    excess = sum(left_of(problem, r) for r in after)
+    return Outcome(bench, problem, found, solved, before, after, has_structure(problem, after), excess)
 
 
 def has_structure(problem: InstrumentProblem, after: Collection[Residual]) -> bool:
@@ -88,13 +88,13 @@ def white(r: Residual) -> bool:
 
 def names_of(outcome: Outcome) -> Names:
     """Names of the causes of a posterior, as far as what is left over allows them."""
-    asked, found, solved = outcome.asked, outcome.found, outcome.solved
-    likely = tuple(c for c in causes(found, outcome.left) if c.probability >= LIKELY)
-    untold = tuple(c for c in likely if c.candidates[0].effect.per_state and not testable(asked, solved, c, likely))
+    problem, posterior, solved = outcome.asked, outcome.found, outcome.solved
+    likely = tuple(c for c in causes(posterior, outcome.left) if c.probability >= LIKELY)
+    untold = tuple(c for c in likely if c.candidates[0].effect.per_state and not testable(problem, solved, c, likely))
     named = tuple(c for c in likely if c not in untold)
     # What as many values as the data have took away may be any structure.
-    left = outcome.left + sum(2 * c.log_odds * found.samples.best.unit for c in untold)
-    return Names(named, doubts(asked, found, solved, named, left=left), untold)
+    excess = outcome.left + sum(2 * c.log_odds * posterior.samples.best.unit for c in untold)
+    return Names(named, doubts(problem, posterior, solved, named, left=excess), untold)
 
 
 @dataclass(frozen=True)
@@ -119,9 +119,9 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     `declared` is the instrument at all the wavelengths of its file.
     """
     wiring, bench = _wired(problem, say, declared)
-    found = bench.run()
+    posterior = bench.run()
     say("testing what is left over")
-    used = outcome_of(bench, found)
+    used = outcome_of(bench, posterior)
     return _told(used, names_of(used), told_switches(used.asked, used.solved), wiring)
 
 
@@ -143,45 +143,45 @@ def _wired(problem: InstrumentProblem, say: Say, declared: InstrumentModel | Non
 
 
 def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: Wiring | None) -> Judged:
-    problem, asked, found, solved = used.bench.problem, used.asked, used.found, used.solved
-    errors = MuellerErrors.of(asked, found, solved)
-    here, later, of_each = errors.changes(solved)
+    problem, predicted, posterior, solved = used.bench.problem, used.asked, used.found, used.solved
+    errors = MuellerErrors.of(predicted, posterior, solved)
+    now, later, of_each = errors.changes(solved)
     each = dict(zip((c.name for c in problem.captures), of_each, strict=True)) if len(of_each) > 1 else {}
     lasting = lasts(later, names.doubt.values())
     judgement = Judgement(
-        named=bool(names.named or switched or found.any_cause),
+        named=bool(names.named or switched or posterior.any_cause),
         sure=bool(names.sure or switched),
         structure=used.structure or bool(names.untold),
-        seen=bool(would_be_seen(found)),
-        figures=checks(asked, solved),
+        seen=bool(would_be_seen(posterior)),
+        figures=checks(predicted, solved),
         # Where there is nothing to apply, nothing is said of what it would do.
-        chances=chances(here, later, lasting, each) if solved.effects else (),
+        chances=chances(now, later, lasting, each) if solved.effects else (),
         first=None if wiring is None else wiring.told,
     )
-    answer = Answer(asked, found, solved, names, judgement, switched)
-    kept, unseen = answer.kept, unobservable(used.bench.whole, found)
+    answer = Answer(predicted, posterior, solved, names, judgement, switched)
+    final, unseen = answer.kept, unobservable(used.bench.whole, posterior)
     # Values that are merely nominal are nowhere near what is true.
     nominal = any(c.place for c in solved.base.candidates)
-    known = judgement.refused is None or not nominal or (judgement.first is None and solved.before.rms < FAR_OFF)
+    is_known = judgement.refused is None or not nominal or (judgement.first is None and solved.before.rms < FAR_OFF)
     diagnosis = Diagnosis(
         **answer.told(
-            recommended=lambda: recommended(problem, kept.space, kept.fit, names.rivals, unseen=missing(unseen)),
-            descriptions=descriptions([c.name for c in asked.captures], used.after),
+            recommended=lambda: recommended(problem, final.space, final.fit, names.rivals, unseen=missing(unseen)),
+            descriptions=descriptions([c.name for c in predicted.captures], used.after),
             captures=[
-                capture_report(asked, k, kept, before, after=after)
+                capture_report(predicted, k, final, before, after=after)
                 for k, (before, after) in enumerate(zip(used.before, used.after, strict=True))
             ],
             unseen=unseen,
-            calibrated=calibrated(problem, found, kept),
+            calibrated=calibrated(problem, posterior, final),
             lasts=lasting,
-            uncertain=errors.uncertain(problem, kept) if known else None,
+            uncertain=errors.uncertain(problem, final) if is_known else None,
         ),
         wiring=judgement.first,
         branch=used.bench.branch,
         left_out=not_measured(problem),
         noise=noise_report(problem),
     )
-    return Judged(diagnosis, problem, kept, used.before, used.after if kept is solved else used.before, used.after)
+    return Judged(diagnosis, problem, final, used.before, used.after if final is solved else used.before, used.after)
 
 
 @one_blas_thread()

@@ -74,7 +74,7 @@ def _of_itself(
 def _standing(problem: InstrumentProblem, solved: Solution, causes: Sequence[Cause]) -> list[Cause]:
     """Shifts of which the edges show too little: an image that moves does so at its edges too."""
     shifts = [c for c in causes if c.candidates[0].moves_image]
-    shifts = [c for c in shifts if all(one in solved.space.candidates for one in c.candidates)]
+    shifts = [c for c in shifts if all(candidate in solved.space.candidates for candidate in c.candidates)]
     if not shifts or not problem.noise_known:
         return []
     edges = at_edges(problem, solved.space, solved.fit.values, [c.candidates for c in shifts])
@@ -88,24 +88,24 @@ def testable(problem: InstrumentProblem, solved: Solution, cause: Cause, causes:
     In all captures together, where something else would show in others, or in one by itself in which they show; with
     those of other causes that are more certain: what hardly takes part does not make them as many as the data.
     """
-    before = [c for other in causes if other is cause or other.log_odds > cause.log_odds for c in other.candidates]
-    sizes = [shown(*found) for found in zip(cause.values, cause.covariance, strict=True)]
+    before = [c for rival in causes if rival is cause or rival.log_odds > cause.log_odds for c in rival.candidates]
+    sizes = [shown(*entry) for entry in zip(cause.values, cause.covariance, strict=True)]
     least = min(1.0, max(sizes))
     excess = max(solved.before.excess, 0.0)
     values, directions, shows = [], [], []
     for k, ((free, power), nm) in enumerate(zip(problem.powers(), problem.wavelengths_nm, strict=True)):
-        seen = excess * power / power.sum()
-        directions.append(free * max(1.0, float(np.sum(seen / (1 + seen)))) if problem.noise_known else free)
+        ratio = excess * power / power.sum()
+        directions.append(free * max(1.0, float(np.sum(ratio / (1 + ratio)))) if problem.noise_known else free)
         values.append(sum(c.size for c in before if c.effect.per_state and c.acts(k, nm)))
         shows.append(
             any(size >= least and c.acts(k, nm) for size, c in zip(sizes, cause.candidates, strict=True)),
         )
-    others = len(causes) - 1
+    other_count = len(causes) - 1
     # What the captures share counts once.
     all_values = sum(c.size for c in before if c.effect.per_state)
     return bool(
-        all_values + others < TESTABLE * sum(directions)
-        or np.any((np.array(values) + others < TESTABLE * np.array(directions)) & shows)
+        all_values + other_count < TESTABLE * sum(directions)
+        or np.any((np.array(values) + other_count < TESTABLE * np.array(directions)) & shows)
     )
 
 

@@ -46,20 +46,20 @@ def at_edges(problem: InstrumentProblem, space: Space, values: Array, shifts: Se
     n = len(shifts)
     curvature, along, square, count, noise = np.zeros((n, n)), np.zeros(n), 0.0, 0, 0.0
     for k in range(len(problem.still)):
-        seen = _of_capture(problem, k, space, values, shifts=shifts)
-        if seen is not None:
-            changes, left, expected = seen
+        edge = _of_capture(problem, k, space, values, shifts=shifts)
+        if edge is not None:
+            changes, residual, expected = edge
             curvature += changes @ changes.T
-            along += changes @ left
-            square, count, noise = square + float(left @ left), count + left.size, noise + expected
+            along += changes @ residual
+            square, count, noise = square + float(residual @ residual), count + residual.size, noise + expected
     share, error = np.zeros(n), np.full(n, np.inf)
-    there = np.diag(curvature) > 0
-    if there.any():
-        inverse = np.linalg.pinv(curvature[np.ix_(there, there)], hermitian=True)
-        share[there] = inverse @ along[there]
+    is_covered = np.diag(curvature) > 0
+    if is_covered.any():
+        inverse = np.linalg.pinv(curvature[np.ix_(is_covered, is_covered)], hermitian=True)
+        share[is_covered] = inverse @ along[is_covered]
         # What else an edge does (interpolation fails there) is no noise, but no shift either.
         unit = max(1.0, (square - along @ share) / count)
-        error[there] = np.sqrt(unit * np.diag(inverse))
+        error[is_covered] = np.sqrt(unit * np.diag(inverse))
     beyond = square - noise
     clear = beyond > LIMIT * np.sqrt(2 * max(noise, 1.0))
     return AtEdges(share, error, float(along @ share) / beyond if clear else 1.0)
@@ -78,8 +78,8 @@ def _of_capture(
     edge = data.steep & inside(*data.steep.shape) & ~data.clipped
     if edge.sum() < FEWEST_AT_EDGES:
         return None
-    here = [[c for c in group if c.acts(k, data.wavelength_nm)] for group in shifts]
-    without = _without(space, values, [c for group in here for c in group])
+    acting = [[c for c in group if c.acts(k, data.wavelength_nm)] for group in shifts]
+    without = _without(space, values, [c for group in acting for c in group])
     changes = problem.changes(k, space, without)
     rest_px = changes.shift_px / data.pitch
     rows, sigma, use = data.values_per_pixel, moments.sigma.astype(np.float32)[:, None, None], moments.counts
@@ -92,11 +92,11 @@ def _of_capture(
     for n in map(int, np.flatnonzero(use)):
         noise += float(free[n] * np.sum(pixels.variance_of(n)[edge] / (sigma[n] * scale) ** 2))
     out = np.zeros((len(shifts), int(use.sum()) * int(edge.sum())))
-    for s, group in enumerate(here):
+    for s, group in enumerate(acting):
         if not group:
             continue
-        others = _without(space, values, [c for each in here if each is not group for c in each])
-        own_px = problem.changes(k, space, others).shift_px / data.pitch - rest_px
+        own_values = _without(space, values, [c for each in acting if each is not group for c in each])
+        own_px = problem.changes(k, space, own_values).shift_px / data.pitch - rest_px
         frames = (fitted * sigma).reshape(data.signal.shape)
         moved = replace(data, signal=frames, true_variance=None).moved_back(-own_px).signal
         change = moved.reshape(images.shape)[:, edge] / sigma[:, :, 0] - fitted[:, edge]

@@ -87,10 +87,10 @@ def derivatives_of_part(u: NDArray[np.floating], rows: slice, columns: slice) ->
     if not derivatives_known(*u.shape[1:]):
         return out
     top, left = max(rows.start - MARGIN, 0), max(columns.start - MARGIN, 0)
-    here = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
+    inner = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
     for n, frame in enumerate(u[:, top : rows.stop + MARGIN, left : columns.stop + MARGIN]):
         for k, (down, right) in enumerate(ORDERS):
-            out[k, n] = cv2.sepFilter2D(frame, -1, FILTERS[right], FILTERS[down])[here]
+            out[k, n] = cv2.sepFilter2D(frame, -1, FILTERS[right], FILTERS[down])[inner]
     return out
 
 

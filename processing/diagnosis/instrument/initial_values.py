@@ -65,24 +65,24 @@ def nearest_branch(problem: InstrumentProblem, found: Mapping[Candidate, Array])
     values = _of_nominal_retardance(problem, found)
     values = {c: _within_half_a_turn(c, v) if _is_azimuth(c) else v for c, v in values.items()}
     places = sorted({c.place for c in values if _is_azimuth(c)})
-    own = _excess(problem, values)
+    excess = _excess(problem, values)
     branches: list[tuple[tuple[str, ...], Values]] = [((), values)]
     for count in range(1, len(places) + 1):
         for turned in combinations(places, count):
-            other = _quarter_turned(problem, values, turned)
-            if _excess(problem, other) <= own * (1 + ALIKE):
-                branches.append((turned, other))
-    branches.sort(key=lambda one: _distance(one[1], places))
-    (turned, best), *others = branches
-    if not others:
+            mirrored = _quarter_turned(problem, values, turned)
+            if _excess(problem, mirrored) <= excess * (1 + ALIKE):
+                branches.append((turned, mirrored))
+    branches.sort(key=lambda branch: _distance(branch[1], places))
+    (turned, best), *rivals = branches
+    if not rivals:
         return Branch(best, None)
-    second, other = others[0]
+    second, mirrored = rivals[0]
     differ = sorted(set(turned) ^ set(second))
     return Branch(
         best,
         f"the captures fit as well with {' and '.join(name.rpartition('.')[0] for name in differ)} turned by 90 "
         "degrees, where row 3 and column 3 of M have the other sign. The instrument file decides: its azimuths are "
-        f"{_distance(best, differ):.0f} degrees from those taken and {_distance(other, differ):.0f} from the others "
+        f"{_distance(best, differ):.0f} degrees from those taken and {_distance(mirrored, differ):.0f} from the others "
         "(rms)",
     )
 
@@ -172,10 +172,10 @@ def first_values(problem: InstrumentProblem, base: Space, pool: Sequence[Candida
     say("far off: searching from many starts")
     if not several:
         return _searched(problem, base, pool, fit)
-    found = along_wavelengths(problem, base, say)
-    space = Space(tuple(found))
-    other = problem.sums(space, space.vector(found), derivatives=False)
-    return found if other.excess.sum() < fit.excess else base.split(fit.values)
+    estimates = along_wavelengths(problem, base, say)
+    space = Space(tuple(estimates))
+    sums = problem.sums(space, space.vector(estimates), derivatives=False)
+    return estimates if sums.excess.sum() < fit.excess else base.split(fit.values)
 
 
 def _searched(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate], fit: Fit) -> Values:
@@ -216,8 +216,8 @@ def _best_start(
     random, start = np.random.default_rng(0), values
     for k in range(starts + 1):
         width = _widths(space, NEAR_DEG if k % 2 else FAR_DEG)
-        here = random.uniform(-1, 1, space.size) * width if k else start
-        tried = minimize(problem, space, here, expansions=0, free=free)
+        point = random.uniform(-1, 1, space.size) * width if k else start
+        tried = minimize(problem, space, point, expansions=0, free=free)
         if tried.excess < best:
             values, best = tried.values, tried.excess
             if tried.rms < enough:
@@ -246,12 +246,12 @@ def along_wavelengths(problem: InstrumentProblem, base: Space, say: Say) -> Valu
     each = [_AtOne(problem.at(w), space, w) for w in wavelengths]
     best: Fit | None = None
     for first in (len(wavelengths) // 2, 0, len(wavelengths) - 1):
-        found: dict[int, Values] = {first: each[first].searched()}
+        solutions: dict[int, Values] = {first: each[first].searched()}
         for k in range(first + 1, len(wavelengths)):
-            found[k] = each[k].beside(_pointed_to(found, each, k, (k - 1, k - 2)))
+            solutions[k] = each[k].beside(_pointed_to(solutions, each, k, (k - 1, k - 2)))
         for k in reversed(range(first)):
-            found[k] = each[k].beside(_pointed_to(found, each, k, (k + 1, k + 2)))
-        fit = minimize(problem, space, _joined(space, [found[k] for k in range(len(wavelengths))]))
+            solutions[k] = each[k].beside(_pointed_to(solutions, each, k, (k + 1, k + 2)))
+        fit = minimize(problem, space, _joined(space, [solutions[k] for k in range(len(wavelengths))]))
         say(f"beginning at {wavelengths[first]:g} nm: {100 * fit.rms:.3g} %")
         if best is None or fit.excess < best.excess:
             best = fit
@@ -285,9 +285,9 @@ class _AtOne:
 
     def beside(self, start: Mapping[str, Array]) -> Values:
         """From values of the same places; what the wavelengths share is held."""
-        own = np.array([c.wavelength_nm is not None for c in self.space.candidates for _ in c.parameters])
+        is_own = np.array([c.wavelength_nm is not None for c in self.space.candidates for _ in c.parameters])
         values = np.concatenate([start[c.short] for c in self.space.candidates])
-        fit = minimize(self.problem, self.space, values, free=own & self._large)
+        fit = minimize(self.problem, self.space, values, free=is_own & self._large)
         return self.space.split(fit.values)
 
 
@@ -312,6 +312,6 @@ def _joined(space: Space, found: Sequence[Values]) -> Array:
         if candidate.curve is not None:
             parts.append(candidate.curve.through(at))
         else:
-            own = [v for each in found for c, v in each.items() if c == candidate]
-            parts.append(own[0])
+            matches = [v for each in found for c, v in each.items() if c == candidate]
+            parts.append(matches[0])
     return np.concatenate(parts)

@@ -136,7 +136,7 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     means = pixels.means()
     # Where too much was subtracted a dark state is negative all over; its noise is not less than that of the read-out.
     sigma = np.sqrt(np.maximum(means.share, np.repeat(data.floor, channels) / 2 * means.inverse))
-    left = pixels.shared[:, 0, 0]
+    share = pixels.shared[:, 0, 0]
     tiles, clipped_tiles = None, None
     by_state = holds_out_states(data)
     grid = _Grid.of(*data.usable.shape)
@@ -159,14 +159,14 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     counts = data.row_counts
     mean = float(means.signal[counts].mean())
     noise_floor = float(np.sqrt(np.mean(means.variance[counts]))) / mean
-    seen = {part: pick for part, pick in picks.items() if pick.any()}
+    parts = {part: pick for part, pick in picks.items() if pick.any()}
     return Moments(
-        blocks=_blocks(data, pixels, seen, folds * by_state, kind=pixels.precision(abs(noise_floor))),
+        blocks=_blocks(data, pixels, parts, folds * by_state, kind=pixels.precision(abs(noise_floor))),
         tiles=tiles,
         clipped=clipped_tiles,
         counts=counts,
         sigma=sigma,
-        left=left,
+        left=share,
         relative=float(np.mean(pixels.scale[pixels.good])) / mean**2,
         spread=float(np.mean(means.share_square[counts] / sigma[counts] ** 4)),
         noise_floor=noise_floor,
@@ -189,7 +189,7 @@ class _Grid:
         side = min(MOST_TILES, max(small // TILE_PX, TILES), small)
         r, rows, y = _divided(height, side)
         c, columns, x = _divided(width, side)
-        boxes = tuple((here, there) for here in rows for there in columns)
+        boxes = tuple((down, across) for down in rows for across in columns)
         return cls(r[:, None] * side + c, boxes, np.tile(x, side), np.repeat(y, side))
 
 
@@ -204,7 +204,7 @@ def _divided(size: int, parts: int) -> tuple[NDArray[np.int64], list[slice], Arr
 
 def _tiles(pixels: Pixels, pick: BoolArray, grid: _Grid, fold: NDArray[np.int64]) -> Tiles:
     rows, count = len(pixels.u), grid.x.size
-    left = pixels.shared[:, 0, 0]
+    share = pixels.shared[:, 0, 0]
     s, noise, number = np.zeros((count, rows, rows)), np.zeros((count, rows)), np.zeros(count)
     x, y = grid.x.copy(), grid.y.copy()
     place_x, place_y = places(*pick.shape)
@@ -213,7 +213,7 @@ def _tiles(pixels: Pixels, pick: BoolArray, grid: _Grid, fold: NDArray[np.int64]
         weight = 1 / pixels.scale[down, across][mine]
         part = pixels.u[:, down, across][:, mine] * np.sqrt(weight)
         s[t], number[t] = part @ part.T, weight.size
-        noise[t] = pixels.variance(slice(None), down, across)[:, mine] @ weight * left
+        noise[t] = pixels.variance(slice(None), down, across)[:, mine] @ weight * share
         # Of a tile at the rim some pixels count, and of those the bright ones: its centre is not where they are.
         light = np.sum(part**2, axis=0)
         if light.any():

@@ -51,13 +51,13 @@ def mueller_slopes(
     problem, values = problem.near(space, values)
     for k, moments in enumerate(problem.moments):
         acting = space.acting(k, problem.wavelengths_nm[k])
-        mine, own = acting.space, acting.of(values)
+        mine, local = acting.space, acting.of(values)
         products, light = np.zeros((16, acting.index.size, acting.index.size)), 0.0
-        changes = problem.changes(k, mine, own)
+        changes = problem.changes(k, mine, local)
         columns = partial(_all_columns, problem, k)
         w, c = columns(changes), problem.coefficients(k, changes)
         u, size, vt = _decomposed(w * moments.counts[:, None])
-        dw, dc = problem.slopes(k, mine, own, w, columns=columns), problem.slopes_of_counts(k, mine, own, c)
+        dw, dc = problem.slopes(k, mine, local, w, columns=columns), problem.slopes_of_counts(k, mine, local, c)
         scale = 1 / moments.sigma[:, None]
         for block in moments.blocks[:: problem.folds if moments.tiles is None else 1]:
             y = np.einsum("fl,flr->lr", c, block.z) * scale
@@ -129,9 +129,9 @@ class MuellerErrors:
         index = found.space.positions(chosen)
         values, captures = found.values[index], len(problem.captures)
         products, each = np.zeros((16, index.size, index.size)), []
-        for own, part in mueller_slopes(problem, space, values, _left(problem, solved)):
-            products[:, own[:, None], own] += part / captures
-            each.append((own, part.sum(axis=0)))
+        for acting, part in mueller_slopes(problem, space, values, _left(problem, solved)):
+            products[:, acting[:, None], acting] += part / captures
+            each.append((acting, part.sum(axis=0)))
         return cls(space, values, found.covariance[np.ix_(index, index)], products, tuple(each))
 
     def given(self, used: Solution) -> Array:
@@ -140,12 +140,12 @@ class MuellerErrors:
 
     def changes(self, used: Solution) -> tuple[PredictedChange, PredictedChange, tuple[PredictedChange, ...]]:
         """What a correction does to M of these captures, of later ones, and of each of these."""
-        given, lasts = self.given(used), np.flatnonzero(self._of("instrument"))
+        correction, lasts = self.given(used), np.flatnonzero(self._of("instrument"))
         products = self.products.sum(axis=0)
         return (
-            self._change(np.arange(given.size), given, products),
-            self._change(lasts, given, products[np.ix_(lasts, lasts)]),
-            tuple(self._change(own, given, part) for own, part in self.of_captures),
+            self._change(np.arange(correction.size), correction, products),
+            self._change(lasts, correction, products[np.ix_(lasts, lasts)]),
+            tuple(self._change(index, correction, part) for index, part in self.of_captures),
         )
 
     def _change(self, own: NDArray[np.int64], given: Array, products: Array) -> PredictedChange:
@@ -190,8 +190,8 @@ class MuellerErrors:
 def _left(problem: InstrumentProblem, solved: Solution) -> Array:
     """What is left over of each capture (captures,) after the correction, in units of its noise; noise at least."""
     noise = np.array([m.noise_floor for m in problem.moments])
-    left = np.array([solved.after.of(k).rms for k in range(noise.size)])
-    return np.asarray(np.maximum(left / np.maximum(noise, 1e-300), 1.0))
+    rms = np.array([solved.after.of(k).rms for k in range(noise.size)])
+    return np.asarray(np.maximum(rms / np.maximum(noise, 1e-300), 1.0))
 
 
 def _leading(covariance: Array, products: Array, lasts: NDArray[np.bool_]) -> tuple[Array, Array]:
@@ -200,12 +200,12 @@ def _leading(covariance: Array, products: Array, lasts: NDArray[np.bool_]) -> tu
     What matters is the error of M of these captures and, as much, of any other capture: there only what `lasts` (K,)
     is wrong still. Forty values of a source in each capture would else leave no room for it.
     """
-    wanted = np.zeros_like(products)
+    weight = np.zeros_like(products)
     for part in (products, products * np.outer(lasts, lasts)):
-        wanted += part / max(float(np.sum(covariance * part)), 1e-300)
+        weight += part / max(float(np.sum(covariance * part)), 1e-300)
     value, vector = np.linalg.eigh(covariance)
     root = vector * np.sqrt(np.maximum(value, 0.0))
-    size, turn = np.linalg.eigh(root.T @ wanted @ root)
+    size, turn = np.linalg.eigh(root.T @ weight @ root)
     return np.maximum(size[::-1], 0.0), (root @ turn)[:, ::-1]
 
 
@@ -227,16 +227,16 @@ def _as_effects(space: Space, direction: Array, size: Array, names: tuple[str, .
     for candidate, part in space.pairs:
         if size[part].max() <= SMALL_PART * size.max():
             continue
-        own = direction[part]
-        for one, values, _ in candidate.by_wavelength(own, np.zeros((own.size, own.size))):
+        step = direction[part]
+        for single, values, _ in candidate.by_wavelength(step, np.zeros((step.size, step.size))):
             effects.append(
                 AppliedEffect(
-                    kind=one.kind,
-                    element=one.place or None,
-                    parameters=_values_alone(one.stored(values, values)),
-                    captures=() if one.scope == "instrument" else _captures(one, names),
-                    scope=one.scope,
-                    wavelength_nm=one.wavelength_nm,
+                    kind=single.kind,
+                    element=single.place or None,
+                    parameters=_values_alone(single.stored(values, values)),
+                    captures=() if single.scope == "instrument" else _captures(single, names),
+                    scope=single.scope,
+                    wavelength_nm=single.wavelength_nm,
                 )
             )
     return tuple(effects)

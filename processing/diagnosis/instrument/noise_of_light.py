@@ -33,19 +33,19 @@ def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new
     """
     problem.relinearize(space, values)
     near, local = problem.near(space, values)
-    there = exactly_undone(space, values, pointwise=True)
+    undone_here = exactly_undone(space, values, pointwise=True)
     gain = pairs = 0.0
     for k, (data, still) in enumerate(zip(near.captures, problem.still, strict=True)):
         if still.noise_estimated or still.told_of_noise:
             continue
-        rest, free = _rest(near, k, space, local)
-        if there:
+        residual, free = _rest(near, k, space, local)
+        if undone_here:
             # What is undone stretches the residual with the counts; their noise is that of counts as they were stored.
-            _, slope = undoing(still, there)(still.signal.astype(float))
-            rest /= np.broadcast_to(slope, still.signal.shape).reshape(rest.shape)
+            _, slope = undoing(still, undone_here)(still.signal.astype(float))
+            residual /= np.broadcast_to(slope, still.signal.shape).reshape(residual.shape)
         share, good = free * near.moments[k].left, data.usable & ~data.clipped
         before, after = (
-            _log_scatter(still, rest, share, near.moments[k].counts, good=good, correct=undoing(still, undone))
+            _log_scatter(still, residual, share, near.moments[k].counts, good=good, correct=undoing(still, undone))
             for undone in ({}, new)
         )
         gain += 0.5 * (before - after)
@@ -60,21 +60,21 @@ def _log_scatter(
 
     Of the rows to `use` (L,), of which `share` (L,) of the noise is in the residual, and of `good` pixels.
     """
-    found = np.zeros(len(good))
+    sums = np.zeros(len(good))
 
     def strip(rows: slice) -> None:
-        left = rest[:, rows].astype(float)
-        light = still.signal[:, :, rows] - left.reshape(still.signal[:, :, rows].shape)
-        variance = still.noise_of(*correct(light)).reshape(left.shape)
+        part = rest[:, rows].astype(float)
+        light = still.signal[:, :, rows] - part.reshape(still.signal[:, :, rows].shape)
+        variance = still.noise_of(*correct(light)).reshape(part.shape)
         # Of neighbours: what both have in common is no noise, but what the fit does not explain.
-        first, second = (slice(k, left.shape[2] // 2 * 2, 2) for k in (0, 1))
-        apart = (left[:, :, first] - left[:, :, second])[use]
-        both = (variance[:, :, first] + variance[:, :, second])[use]
-        scatter = np.sum(apart**2 / both, axis=0) + np.tensordot(share[use], np.log(both), 1)
-        found[rows.start] = scatter[good[rows, first] & good[rows, second]].sum()
+        first, second = (slice(k, part.shape[2] // 2 * 2, 2) for k in (0, 1))
+        apart = (part[:, :, first] - part[:, :, second])[use]
+        pair_noise = (variance[:, :, first] + variance[:, :, second])[use]
+        scatter = np.sum(apart**2 / pair_noise, axis=0) + np.tensordot(share[use], np.log(pair_noise), 1)
+        sums[rows.start] = scatter[good[rows, first] & good[rows, second]].sum()
 
     for_strips(len(good), strip)
-    return float(found.sum())
+    return float(sums.sum())
 
 
 def _rest(problem: InstrumentProblem, k: int, space: Space, values: Array) -> tuple[NDArray[np.float32], Array]:
@@ -86,5 +86,5 @@ def _rest(problem: InstrumentProblem, k: int, space: Space, values: Array) -> tu
     y = add_response(counts, problem.coefficients(k, changes), a)
     q = range_of(a)
     outside = (np.eye(len(a)) - q @ q.T) * level[:, None] / level
-    rest = outside.astype(np.float32) @ y.reshape(len(a), -1)
-    return rest.reshape(y.shape), 1 - np.sum(q * q, axis=1)
+    residual = outside.astype(np.float32) @ y.reshape(len(a), -1)
+    return residual.reshape(y.shape), 1 - np.sum(q * q, axis=1)

@@ -74,16 +74,16 @@ def with_noise_of_light(data: CaptureData, a: Array, bends: Mapping[Candidate, A
     least, usual = max(abs(data.noise_level[0] - 1), GAIN_OFF), (1.0, 1.0)
     # An offset looks like another read-out noise, and the reverse.
     data = _scaled(data, usual if bends else data.noise_factors, usual)
-    found = _shown(data, a, bends)
-    if found is None:
+    noise = _shown(data, a, bends)
+    if noise is None:
         return _of_light(data, bends)
-    factors = noise_factors(found, 1.0, estimated=False) if bends else data.noise_factors
-    if bends and factors == usual and abs(found.white - 1) > least + SHOWN * found.white_error:
+    factors = noise_factors(noise, 1.0, estimated=False) if bends else data.noise_factors
+    if bends and factors == usual and abs(noise.white - 1) > least + SHOWN * noise.white_error:
         return None
     if factors != data.noise_factors:
         data = _scaled(data, factors, usual)
-        found = _shown(data, a, bends) or found
-    return _of_light(_scaled(data, factors, _level(found)), bends)
+        noise = _shown(data, a, bends) or noise
+    return _of_light(_scaled(data, factors, _level(noise)), bends)
 
 
 def _level(found: DetectorNoise) -> tuple[float, float]:
@@ -91,10 +91,10 @@ def _level(found: DetectorNoise) -> tuple[float, float]:
 
     A constant offset that nothing else shows changes the noise without light alone.
     """
-    both, dark = (GAIN_OFF / 2) ** 2, np.diag([0.0, DARK_NOISE_OFF**2])
-    known = both + dark
-    told = known @ np.linalg.solve(known + found.covariance, np.array([found.shot, found.dark]) - 1)
-    return float(np.clip(1 + told[0], 1 - NOISE_OFF, 1 + NOISE_OFF)), float(max(1 + told[1], LEAST_PART))
+    common, dark = (GAIN_OFF / 2) ** 2, np.diag([0.0, DARK_NOISE_OFF**2])
+    prior = common + dark
+    deviation = prior @ np.linalg.solve(prior + found.covariance, np.array([found.shot, found.dark]) - 1)
+    return float(np.clip(1 + deviation[0], 1 - NOISE_OFF, 1 + NOISE_OFF)), float(max(1 + deviation[1], LEAST_PART))
 
 
 def _scaled(data: CaptureData, factors: tuple[float, float], level: tuple[float, float]) -> CaptureData:

@@ -158,12 +158,12 @@ class Part:
 def features_of_pixels(pixels: Pixels, pick: BoolArray) -> tuple[Array, Array]:
     """Weighted features (F, L, P) of a few pixels (rows, columns), and the noise (L, F, F) of their products."""
     everything = slice(0, pick.shape[1])
-    found = [
+    parts = [
         pixels.part(strip, everything, np.float64).weighted(np.flatnonzero(pick[strip]))
         for strip in pixels.strips()
         if pick[strip].any()
     ]
-    return np.concatenate([z for z, _ in found], axis=2), np.sum([noise for _, noise in found], axis=0)
+    return np.concatenate([z for z, _ in parts], axis=2), np.sum([noise for _, noise in parts], axis=0)
 
 
 def products_of_pixels(pixels: Pixels, picks: Sequence[BoolArray], kind: Precision) -> list[tuple[Array, Array]]:

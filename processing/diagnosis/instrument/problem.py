@@ -66,8 +66,8 @@ class InstrumentProblem:
         # The captures as taken (corrected already if they were moved back), and how far the model says that they moved.
         self.still = tuple(captures)
         pairs = zip(self.models, captures, strict=True)
-        own = (changes_of(m, c.conditions, c.name).shift_px / c.pitch for m, c in pairs)
-        self.own_px = tuple(s if movable(s) else np.zeros_like(s) for s in own)
+        shifts = (changes_of(m, c.conditions, c.name).shift_px / c.pitch for m, c in pairs)
+        self.own_px = tuple(s if movable(s) else np.zeros_like(s) for s in shifts)
         self.captures = self.still if moved_back else _moved_back(self.still, self.own_px)
         self.folds = folds or folds_of(self.captures)
         self.moments: tuple[Moments, ...] = tuple(moments_of(c, self.folds) for c in self.captures)
@@ -78,8 +78,8 @@ class InstrumentProblem:
 
     def nominal(self) -> tuple[Candidate, ...]:
         """Values that the instrument file calls nominal, if a known sample is there to fit them to."""
-        known = any(c.sample is not None for c in self.captures)
-        return nominal_values(self.model, self.captures[0].conditions, self.wavelengths_nm) if known else ()
+        has_sample = any(c.sample is not None for c in self.captures)
+        return nominal_values(self.model, self.captures[0].conditions, self.wavelengths_nm) if has_sample else ()
 
     def levels(self) -> tuple[Candidate, ...]:
         """Levels of the sources that several channels see, where the sample is unknown; else they are projected out."""
@@ -96,12 +96,12 @@ class InstrumentProblem:
 
     def pool(self) -> tuple[Candidate, ...]:
         """Every effect at every place of the captures, without those that a free level of the source takes up."""
-        found = pool(self.model, [c.conditions for c in self.captures], self.wavelengths_nm)
+        candidates = pool(self.model, [c.conditions for c in self.captures], self.wavelengths_nm)
 
         def is_taken_up(level: Candidate) -> bool:
             return all(self.has_free_level(k) for k, nm in enumerate(self.wavelengths_nm) if level.acts(k, nm))
 
-        return tuple(c for c in found if not (c.effect.is_level and is_taken_up(c)))
+        return tuple(c for c in candidates if not (c.effect.is_level and is_taken_up(c)))
 
     def powers(self) -> list[tuple[int, Array]]:
         """Rows that the unknowns leave over, and the power of each component of the signal, for each capture."""
@@ -123,10 +123,10 @@ class InstrumentProblem:
     def near(self, space: Space, values: Array) -> tuple[InstrumentProblem, Array]:
         """The problem expanded nearest to these values, and what is left of the values there."""
         best, least = self, distance({}, space, values)
-        for other in self._others:
-            away = distance(other.undone, space, values)
-            if set(other.undone) <= set(space.candidates) and away < least:
-                best, least = other, away
+        for point in self._others:
+            away = distance(point.undone, space, values)
+            if set(point.undone) <= set(space.candidates) and away < least:
+                best, least = point, away
         local = values.copy()
         for candidate, part in space.pairs:
             if candidate in best.undone:
@@ -135,24 +135,24 @@ class InstrumentProblem:
 
     def relinearize(self, space: Space, values: Array) -> bool:
         """Expand about these values from now on, unless a point as close is known."""
-        known, _ = self.near(space, values)
-        if distance(known.undone, space, values) < EXACT:
+        nearest, _ = self.near(space, values)
+        if distance(nearest.undone, space, values) < EXACT:
             return False
         undone = exactly_undone(space, values)
         bent = {c: v for c, v in undone.items() if c.is_pointwise}
-        shifts = [own + self._shift_px(k, undone) for k, own in enumerate(self.own_px)]
+        shifts = [shift + self._shift_px(k, undone) for k, shift in enumerate(self.own_px)]
         if not all(movable(s) for s in shifts):
             return False
         still = [c.undone(undoing(c, bent)) if bent else c for c in self.still]
-        there = InstrumentProblem(self.models, _moved_back(still, shifts), undone, self.folds, moved_back=True)
-        if not all(np.all(np.isfinite(m.sigma)) and np.all(m.sigma > 0) for m in there.moments):
+        expansion = InstrumentProblem(self.models, _moved_back(still, shifts), undone, self.folds, moved_back=True)
+        if not all(np.all(np.isfinite(m.sigma)) and np.all(m.sigma > 0) for m in expansion.moments):
             # So far away that there are no such counts.
             return False
         # What is kept of the tiles is large: that of one point at a time.
         for point in (self, *self._others):
             for moments in point.moments:
                 moments.forget_features()
-        self._others.append(there)
+        self._others.append(expansion)
         del self._others[:-MOST_POINTS]
         return True
 
@@ -229,8 +229,8 @@ class InstrumentProblem:
         # At zero an effect does nothing: there is no need to ask it.
         other_than_zero = [0, *np.cumsum(values != 0).tolist()]
         for candidate, part in space.pairs:
-            there = other_than_zero[part.stop] > other_than_zero[part.start]
-            if there and candidate.acts(capture, data.wavelength_nm):
+            is_active = other_than_zero[part.stop] > other_than_zero[part.start]
+            if is_active and candidate.acts(capture, data.wavelength_nm):
                 candidate.apply(changes, model, values[part])
         return changes
 
@@ -312,38 +312,38 @@ class InstrumentProblem:
 
     def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
         """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
-        other, local = self.near(space, values)
-        if other is not self:
-            return other.sums(space, local, derivatives=derivatives)
+        nearest, local = self.near(space, values)
+        if nearest is not self:
+            return nearest.sums(space, local, derivatives=derivatives)
         out = Sums.empty(self.folds, space.size if derivatives else 0, len(self.captures))
         for k, data in enumerate(self.captures):
             acting = space.acting(k, data.wavelength_nm)
-            mine, own = acting.space, acting.of(values)
+            mine, values_k = acting.space, acting.of(values)
             part = Sums.empty(self.folds, mine.size if derivatives else 0)
-            changes = self.changes(k, mine, own)
+            changes = self.changes(k, mine, values_k)
             varies = derivatives and any(c.effect.varies_over_image for c in mine.candidates)
             if changes.field_retardance_rad or varies:
-                self._tile_sums(k, mine, own, changes, out=part, derivatives=derivatives)
+                self._tile_sums(k, mine, values_k, changes, out=part, derivatives=derivatives)
             else:
-                self._block_sums(k, mine, own, changes, out=part, derivatives=derivatives)
+                self._block_sums(k, mine, values_k, changes, out=part, derivatives=derivatives)
             out.add(k, part, acting)
         return out
 
     def noise_information(self, space: Space, values: Array) -> Array:
         """Part (K, K) of the curvature that is noise of image derivatives and tells nothing about the values."""
-        other, local = self.near(space, values)
-        if other is not self:
-            return other.noise_information(space, local)
+        nearest, local = self.near(space, values)
+        if nearest is not self:
+            return nearest.noise_information(space, local)
         out = np.zeros((space.size, space.size))
         for k, moments in enumerate(self.moments):
             acting = space.acting(k, self.wavelengths_nm[k])
-            mine, own = acting.space, acting.of(values)
-            changes = self.changes(k, mine, own)
+            mine, values_k = acting.space, acting.of(values)
+            changes = self.changes(k, mine, values_k)
             a = self.columns(k, changes)
-            dc = self.slopes_of_counts(k, mine, own, self.coefficients(k, changes))
+            dc = self.slopes_of_counts(k, mine, values_k, self.coefficients(k, changes))
             if np.any(dc[:, -DERIVATIVES:]):
-                told = np.sum([noise_information(block, a, dc, moments) for block in moments.blocks], axis=0)
-                out[np.ix_(acting.index, acting.index)] += acting.spread_products(told)
+                noise = np.sum([noise_information(block, a, dc, moments) for block in moments.blocks], axis=0)
+                out[np.ix_(acting.index, acting.index)] += acting.spread_products(noise)
         return out
 
     def time_noise(self, space: Space, values: Array) -> Array:

@@ -41,8 +41,8 @@ class NoiseOfParts:
         self.of_features = self._of_features().swapaxes(1, 2)
 
     def _of_features(self) -> Array:
-        own = np.diagonal(self._outside, axis1=1, axis2=2)[..., None]
-        out = np.asarray(own * self._joined)
+        diagonal = np.diagonal(self._outside, axis1=1, axis2=2)[..., None]
+        out = np.asarray(diagonal * self._joined)
         if not self._around.size:
             return out
         hat = self._q @ self._q.transpose(0, 2, 1)
@@ -52,8 +52,8 @@ class NoiseOfParts:
             # (T, M, L, L): from the noise of each row to the residual, by way of each derivative.
             takes = narrow @ self._q.transpose(0, 2, 1)[:, None]
             noise = self._noise[..., self._moving]
-            here = np.diagonal(takes, axis1=2, axis2=3).swapaxes(1, 2)
-            out[..., self._plain] += np.einsum("tlm,tlfm->tlf", here, noise[:, :, self._plain])
+            direct = np.diagonal(takes, axis1=2, axis2=3).swapaxes(1, 2)
+            out[..., self._plain] += np.einsum("tlm,tlfm->tlf", direct, noise[:, :, self._plain])
             # One product over rows and derivatives.
             wide = (hat[:, None] * takes).swapaxes(1, 2).reshape(*hat.shape[:2], -1)
             of_around = noise[:, :, self._around].transpose(0, 3, 1, 2)
@@ -70,8 +70,8 @@ class NoiseOfParts:
             joined = self._by_feature(self._joined[..., moving])
             out += np.sum(joined * back_of, axis=1)
             noise = self._noise[:, :, moving][..., moving]
-            whole = joined * back[:, None] + np.einsum("tlfg,tflk->tglk", noise, back_of)
-            out += np.sum(c * fitted(self._q[:, None], whole), axis=1)
+            total = joined * back[:, None] + np.einsum("tlfg,tflk->tglk", noise, back_of)
+            out += np.sum(c * fitted(self._q[:, None], total), axis=1)
         return np.asarray(self._outside @ out)
 
     @staticmethod
@@ -240,10 +240,10 @@ def add_parts(
 
     `rows` (T or 1, L) : of each part; `pixels` (T,) : how many stand behind it.
     """
-    squares, left = np.sum(parts.residual**2, axis=2), float(parts.expected.sum())
+    squares, expected = np.sum(parts.residual**2, axis=2), float(parts.expected.sum())
     free = pixels[:, None] * np.diagonal(parts.outside, axis1=1, axis2=2)
-    out.excess[fold] += squares.sum() - left
-    out.freedom[fold] += left
+    out.excess[fold] += squares.sum() - expected
+    out.freedom[fold] += expected
     out.square[fold] += np.sum(squares * moments.sigma[rows] ** 2) * moments.relative
     out.count[fold] += np.sum(free * moments.left[rows])
 

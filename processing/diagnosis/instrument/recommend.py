@@ -97,21 +97,21 @@ def _power(
     unseen: Sequence[Candidate],
 ) -> float:
     signatures = [_signature(problem, space, fit, sample.reshape(16), candidate=c) for c in rivals or unseen]
-    seen = [bool(np.linalg.norm(each) >= VISIBLE) for each in signatures]
+    is_visible = [bool(np.linalg.norm(each) >= VISIBLE) for each in signatures]
     if not rivals:
-        return float(np.mean(seen)) if seen else 0.0
-    return least_apart(signatures) if all(seen) or len(rivals) == 1 else 0.0
+        return float(np.mean(is_visible)) if is_visible else 0.0
+    return least_apart(signatures) if all(is_visible) or len(rivals) == 1 else 0.0
 
 
 def _signature(problem: InstrumentProblem, space: Space, fit: Fit, sample: Array, *, candidate: Candidate) -> Array:
     """Change (L, parameters) of the relative signal for typical sizes, the throughput projected out."""
     capture = next(k for k, w in enumerate(problem.wavelengths_nm) if candidate.acts(k, w))
-    both = Space((*space.candidates, candidate)) if candidate not in space.candidates else space
-    zero = np.concatenate([fit.values, np.zeros(both.size - space.size)])
-    part = both.slices[both.candidates.index(candidate)]
+    joint = Space((*space.candidates, candidate)) if candidate not in space.candidates else space
+    zero = np.concatenate([fit.values, np.zeros(joint.size - space.size)])
+    part = joint.slices[joint.candidates.index(candidate)]
 
     def signal(values: Array) -> Array:
-        return np.asarray(problem.rows(capture, both, values) @ sample)
+        return np.asarray(problem.rows(capture, joint, values) @ sample)
 
     start = signal(zero)
     scale = np.linalg.norm(start)

@@ -42,7 +42,7 @@ class StoredResidual:
 def write_residuals(path: Path, judged: Judged, problem: InstrumentProblem) -> None:
     """Write the residuals of every capture to a new .npz file. Raises ProcessError if it exists."""
     arrays: dict[str, Any] = {}
-    told = []
+    entries = []
     for k, data in enumerate(problem.captures):
         harmonics = {}
         for moment, residual in zip(MOMENTS, (judged.before[k], judged.after[k]), strict=True):
@@ -50,10 +50,10 @@ def write_residuals(path: Path, judged: Judged, problem: InstrumentProblem) -> N
             arrays[f"image_{moment}_{k}"] = np.clip(residual.image, -LARGEST_HALF, LARGEST_HALF).astype(np.float16)
             arrays[f"per_state_{moment}_{k}"] = residual.per_state
             harmonics[moment] = {axis: values.tolist() for axis, values in residual.harmonics.items()}
-        told.append({"name": data.name, "harmonics": harmonics})
+        entries.append({"name": data.name, "harmonics": harmonics})
     try:
         with whole_file(path, new=True) as new, new.open("wb") as file:
-            np.savez_compressed(file, told=np.array(json.dumps(told)), **arrays)
+            np.savez_compressed(file, told=np.array(json.dumps(entries)), **arrays)
     except FileExistsError as error:
         raise ProcessError(f"{path} exists and is not replaced. Give another --residuals.") from error
 
@@ -62,15 +62,15 @@ def read_residuals(path: Path) -> list[StoredResidual]:
     """Residuals of every capture from such a file. Raises ProcessError."""
     try:
         with np.load(path, allow_pickle=False) as stored:
-            told = json.loads(str(stored["told"]))
+            entries = json.loads(str(stored["told"]))
             return [
                 StoredResidual(
-                    name=str(one["name"]),
+                    name=str(entry["name"]),
                     images={m: stored[f"image_{m}_{k}"] for m in MOMENTS},
                     per_state={m: stored[f"per_state_{m}_{k}"] for m in MOMENTS},
-                    harmonics=one["harmonics"],
+                    harmonics=entry["harmonics"],
                 )
-                for k, one in enumerate(told)
+                for k, entry in enumerate(entries)
             ]
     except DAMAGE as error:
         raise ProcessError(f"{path} is no file of residuals of a diagnosis ({error})") from error

@@ -38,7 +38,7 @@ def slopes_of_rows(
     """
     da = np.zeros((space.size, *a.shape))
     channels = len(conditions.channels)
-    whole: dict[str, Array] = {}
+    by_axis: dict[str, Array] = {}
     for candidate, part in fitted(space):
         if candidate.acts_on_counts or (candidate.effect.varies_over_image and not varying):
             continue
@@ -56,11 +56,11 @@ def slopes_of_rows(
         if slips is not None and not values[part].any():
             # The same step of the same axis from another state on: one evaluation serves all of them.
             axis, first = slips
-            if axis not in whole:
+            if axis not in by_axis:
                 turned = changes_of(values)
                 turned.turn_axis(axis, np.full(conditions.states, STEP), turned_by(model, axis))
-                whole[axis] = (columns(turned) - a) / STEP
-            da[part.start, ..., first * channels :, :] = whole[axis][..., first * channels :, :]
+                by_axis[axis] = (columns(turned) - a) / STEP
+            da[part.start, ..., first * channels :, :] = by_axis[axis][..., first * channels :, :]
             continue
         for j, (moved, step_j) in enumerate(stepped(candidate, part, values)):
             da[part.start + j] = (columns(changes_of(moved)) - a) / step_j

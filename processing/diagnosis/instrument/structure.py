@@ -92,12 +92,12 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     level, pixels = moments.sigma, Pixels(data)
     free = np.zeros((rows, height, width), dtype=np.float32)
     signal = np.zeros((rows, height, width), dtype=np.float32)
-    for here, columns in _parts(problem, capture, changes, a):
+    for area, columns in _parts(problem, capture, changes, a):
         q = range_of(columns / level[:, None] * moments.counts[:, None])
-        part = y[:, *here]
+        part = y[:, *area]
         onto = (q * level[:, None]).astype(np.float32) @ (q.T / level).astype(np.float32)
-        signal[:, *here] = (onto @ part.reshape(rows, -1)).reshape(part.shape)
-        free[:, *here] = (1 - np.sum(q * q, axis=1))[:, None, None]
+        signal[:, *area] = (onto @ part.reshape(rows, -1)).reshape(part.shape)
+        free[:, *area] = (1 - np.sum(q * q, axis=1))[:, None, None]
     r = y - signal
     with np.errstate(divide="ignore", invalid="ignore"):
         r /= level[:, None, None].astype(np.float32) * np.sqrt(pixels.scale).astype(np.float32)
@@ -113,7 +113,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     good = np.asarray(np.isfinite(r).all(axis=0))
     images = Images(r, around, expected, good)
     alike = _alike(data)
-    tests, left = _tests(images, moments.left, alike, a.shape[1], spread=moments.spread, noise_known=data.noise_known)
+    tests, excess = _tests(images, moments.left, alike, a.shape[1], spread=moments.spread, noise_known=data.noise_known)
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
     states = mean.reshape(n, channels).mean(axis=1)
@@ -130,7 +130,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
         correlates=correlates_of(r, signal, good),
         leading=vector[:, -1],
         leading_share=float(value[-1] / max(value.sum(), 1e-300)),
-        left=left,
+        left=excess,
     )
 
 
@@ -193,14 +193,14 @@ def _tests(
     count = int(good.sum())
     if count == 0 or not noise_known:
         return {}, 0.0
-    flat, wanted = r[:, good], expected[:, good]
+    flat, noise = r[:, good], expected[:, good]
     # Of smooth patterns moved frames keep all the noise, of single pixels only a part.
-    freedom = shown @ wanted.sum(axis=1, dtype=float)
+    freedom = shown @ noise.sum(axis=1, dtype=float)
     # Name to chi-square beyond noise, and its standard deviation with nothing but noise.
-    found = {"sum of squares": (_square(flat) - freedom, deviation_of(max(freedom, 1e-300), spread))}
+    tests = {"sum of squares": (_square(flat) - freedom, deviation_of(max(freedom, 1e-300), spread))}
     if count < FEWEST_PIXELS:
         # What goes with the signal, or with the place, needs an image.
-        return in_deviations(found)
+        return in_deviations(tests)
     # Linear in the signal: every pixel's residual against the leading components of the fitted signal near by.
     s = images.around[:, good]
     _, size, vt = np.linalg.svd((s @ s.T).astype(float))
@@ -208,15 +208,15 @@ def _tests(
     turned = vt[:keep] / np.sqrt(np.maximum(size[:keep], 1e-300))[:, None]
     weights = turned.astype(np.float32) @ s
     linear = flat @ weights.T
-    null = (wanted @ (weights.T**2)).sum(dtype=float)
-    found["linear in the signal"] = (_square(linear) - null, np.sqrt(2 * null * spread))
+    null = (noise @ (weights.T**2)).sum(dtype=float)
+    tests["linear in the signal"] = (_square(linear) - null, np.sqrt(2 * null * spread))
     # Brightness: against the square of the signal, its linear part taken away.
     np.square(s, out=s)
     s -= (s @ weights.T) @ weights
     s /= np.sqrt(np.sum(s**2, axis=1, keepdims=True, dtype=float)).astype(np.float32) + np.float32(1e-30)
     along = np.sum(flat * s, axis=1, dtype=float)
-    expectation = np.sum(wanted * s**2, axis=1, dtype=float)
-    found["brightness"] = (
+    expectation = np.sum(noise * s**2, axis=1, dtype=float)
+    tests["brightness"] = (
         np.sum(along**2) - expectation.sum(),
         np.sqrt(2 * np.sum(expectation**2) * spread + 1e-300),
     )
@@ -224,17 +224,17 @@ def _tests(
     for k, name in enumerate(("neighbours, rows", "neighbours, columns")):
         if r.shape[k + 1] > 2:
             first, second = (slice(None),) * (k + 1) + (slice(-1),), (slice(None),) * (k + 1) + (slice(1, None),)
-            both = good[first[1:]] & good[second[1:]]
+            is_pair = good[first[1:]] & good[second[1:]]
             product = r[first] * r[second]
-            product[:, ~both] = 0.0
-            if both.sum() * len(r) > FEWEST_OF_MANY:
-                null = alike[:, k] @ np.sum(expected[first], axis=(1, 2), where=both, dtype=float)
+            product[:, ~is_pair] = 0.0
+            if is_pair.sum() * len(r) > FEWEST_OF_MANY:
+                null = alike[:, k] @ np.sum(expected[first], axis=(1, 2), where=is_pair, dtype=float)
                 # The residuals of the rows of one pixel go together: a pair of pixels counts as one.
                 pairs = product.sum(axis=0, dtype=float)
-                found[name] = (pairs.sum() - null, np.sqrt(_square(pairs)))
+                tests[name] = (pairs.sum() - null, np.sqrt(_square(pairs)))
     # Tiles: mean residual of every row over patches of the image.
-    found["patches"] = _patches(r, expected, spread)
-    return in_deviations(found)
+    tests["patches"] = _patches(r, expected, spread)
+    return in_deviations(tests)
 
 
 def _square(x: NDArray[np.floating]) -> float:
@@ -279,8 +279,8 @@ def descriptions(names: Sequence[str], left: Sequence[Residual]) -> tuple[str, .
     several = len(names) > 1
     return tuple(
         f"{name}: {line}" if several else line
-        for name, found in zip(names, left, strict=True)
-        for line in description(found)
+        for name, of_capture in zip(names, left, strict=True)
+        for line in description(of_capture)
     )
 
 

@@ -90,25 +90,25 @@ def features_of_tiles(
     Of the rows that count, in units of their noise. `used` are numbers of FEATURES in ascending order, of which the
     counts are the first; others may stand beside them.
     """
-    kept, asked = tiles.features, tuple(used)
-    if asked not in kept:
-        if asked != PLAIN:
-            for known, (z, noise) in kept.items():
-                if set(asked) <= set(known):
-                    return known, z, noise
+    cache, numbers = tiles.features, tuple(used)
+    if numbers not in cache:
+        if numbers != PLAIN:
+            for key, (z, noise) in cache.items():
+                if set(numbers) <= set(key):
+                    return key, z, noise
             # One set of them is kept, with all that was asked for before: they are large.
-            larger = [known for known in kept if known != PLAIN]
-            asked = tuple(sorted(set(asked).union(*larger)))
-            for known in larger:
-                del kept[known]
+            larger = [key for key in cache if key != PLAIN]
+            numbers = tuple(sorted(set(numbers).union(*larger)))
+            for key in larger:
+                del cache[key]
         use = np.flatnonzero(moments.counts)
-        z, noise = _of_counts(tiles, use) if asked == PLAIN else _of_features(data, tiles, np.array(asked), use)
+        z, noise = _of_counts(tiles, use) if numbers == PLAIN else _of_features(data, tiles, np.array(numbers), use)
         # In place: they are large.
         sigma = moments.sigma[use]
         z /= sigma[:, None]
         noise /= (sigma**2)[:, None, None]
-        kept[asked] = z, noise
-    return asked, *kept[asked]
+        cache[numbers] = z, noise
+    return numbers, *cache[numbers]
 
 
 def _of_counts(tiles: Tiles, use: NDArray[np.int64]) -> tuple[Array, Array]:
@@ -218,9 +218,9 @@ def add_slopes(parts: Iterable[tuple[NDArray[np.int64], Projected]], slopes: Til
 
     Projected tiles are large: of those that were seen the products of their unknowns are kept, and P.
     """
-    own, of_one = np.concatenate([slopes.fields, slopes.counted]), slopes.at_nodes.shape[1:]
+    index, of_one = np.concatenate([slopes.fields, slopes.counted]), slopes.at_nodes.shape[1:]
     of_excess, of_noise = np.zeros((2, *of_one))
-    across = np.zeros((of_one[0], own.size * of_one[1] * of_one[2]))
+    across = np.zeros((of_one[0], index.size * of_one[1] * of_one[2]))
     tiles, outside, power = [], [], []
     for some, part in parts:
         tiles.append(some)
@@ -229,16 +229,16 @@ def add_slopes(parts: Iterable[tuple[NDArray[np.int64], Projected]], slopes: Til
         shares = slopes.shares[:, some]
         for total, by_rows in zip((of_excess, of_noise), part.by_rows, strict=True):
             total += np.tensordot(shares, by_rows, axes=1)
-        if own.size:
+        if index.size:
             moved = _add_own(some, part, slopes, fold, out=out)
             across += shares @ (moved @ part.unknowns).swapaxes(0, 1).reshape(len(some), -1)
     flat = slopes.at_nodes.reshape(len(slopes.at_nodes), -1)
     out.gradient[fold] += flat @ of_excess.reshape(-1)
     out.stretch[fold] += flat @ of_noise.reshape(-1)
-    by_own = across.reshape(of_one[0], own.size, of_one[1] * of_one[2]).swapaxes(0, 1)
-    with_own = by_own.reshape(own.size, flat.shape[1]) @ flat.T
-    out.curvature[fold, own] -= with_own
-    out.curvature[fold, :, own] -= with_own
+    by_own = across.reshape(of_one[0], index.size, of_one[1] * of_one[2]).swapaxes(0, 1)
+    with_own = by_own.reshape(index.size, flat.shape[1]) @ flat.T
+    out.curvature[fold, index] -= with_own
+    out.curvature[fold, :, index] -= with_own
     if tiles:
         shares = slopes.shares[:, np.concatenate(tiles)]
         out.curvature[fold] += _curvature(slopes.at_nodes, shares, np.concatenate(outside), np.concatenate(power))
@@ -247,17 +247,17 @@ def add_slopes(parts: Iterable[tuple[NDArray[np.int64], Projected]], slopes: Til
 def _add_own(some: NDArray[np.int64], part: Projected, slopes: TileSlopes, fold: int, *, out: Sums) -> Array:
     """Add what fields and counts tell by themselves; what (J + C, T, L, R) they do to the residual."""
     fields, counted = slopes.fields, slopes.counted
-    da, dc, own = slopes.da[:, some], slopes.dc[:, None], np.concatenate([fields, counted])
-    moved = np.zeros((own.size, *part.residual.shape))
+    da, dc, index = slopes.da[:, some], slopes.dc[:, None], np.concatenate([fields, counted])
+    moved = np.zeros((index.size, *part.residual.shape))
     moved[: fields.size] = -(part.outside @ da) @ part.unknowns.swapaxes(1, 2)
     for of_one, each in zip(moved[fields.size :], dc, strict=True):
         of_one[:] = part.moved_by_counts(each)
     of_fields = da.reshape(fields.size, part.by_rows[1].size) @ part.by_rows[1].reshape(-1)
     pull = np.concatenate([of_fields, part.pull_of_counts(dc)])
-    flat = moved.reshape(own.size, part.residual.size)
-    out.stretch[fold, own] += pull
-    out.gradient[fold, own] += flat @ part.residual.reshape(-1) - pull
-    out.curvature[fold, own[:, None], own] += flat @ flat.T
+    flat = moved.reshape(index.size, part.residual.size)
+    out.stretch[fold, index] += pull
+    out.gradient[fold, index] += flat @ part.residual.reshape(-1) - pull
+    out.curvature[fold, index[:, None], index] += flat @ flat.T
     return moved
 
 
@@ -293,29 +293,29 @@ def add_tiles(
 
     `apart` : rows of a state, where every state has unknowns of its own; None: all rows have the same unknowns.
     """
-    asked = np.any(c, axis=1) if slopes is None else np.any(c, axis=1) | np.any(slopes.dc, axis=(0, 2))
-    used, use = np.flatnonzero(asked), np.flatnonzero(moments.counts)
-    known, z, noise = features_of_tiles(data, moments, tiles, used.tolist())
-    mine = np.searchsorted(known, used)
+    is_used = np.any(c, axis=1) if slopes is None else np.any(c, axis=1) | np.any(slopes.dc, axis=(0, 2))
+    used, use = np.flatnonzero(is_used), np.flatnonzero(moments.counts)
+    columns, z, noise = features_of_tiles(data, moments, tiles, used.tolist())
+    mine = np.searchsorted(columns, used)
     around = used >= len(FEATURES) - DERIVATIVES
 
     def projected(fold: int, kept: slice) -> Iterator[tuple[NDArray[np.int64], Projected]]:
         rows = use[kept]
-        scatter = noise[:, kept] if len(known) == used.size else noise[:, kept, mine[:, None], mine]
-        here = np.flatnonzero(tiles.fold == fold)
-        for some in np.split(here, range(TILES_TOGETHER, here.size, TILES_TOGETHER)):
+        scatter = noise[:, kept] if len(columns) == used.size else noise[:, kept, mine[:, None], mine]
+        in_fold = np.flatnonzero(tiles.fold == fold)
+        for some in np.split(in_fold, range(TILES_TOGETHER, in_fold.size, TILES_TOGETHER)):
             features = z[some[:, None], mine, kept]
             part = Projected(features, scatter[some], a[some][:, rows], c[None, used][:, :, rows], around=around)
             add_parts(part, moments, rows[None], tiles.pixels[some], fold=fold, out=out)
             yield some, part
 
-    for kept in _together(use, apart):
-        of_rows = None if slopes is None else slopes.of_rows(use[kept], used)
+    for selection in _together(use, apart):
+        of_rows = None if slopes is None else slopes.of_rows(use[selection], used)
         for fold in range(len(out.excess)):
             if of_rows is None:
-                deque(projected(fold, kept), maxlen=0)
+                deque(projected(fold, selection), maxlen=0)
             else:
-                add_slopes(projected(fold, kept), of_rows, fold, out)
+                add_slopes(projected(fold, selection), of_rows, fold, out)
 
 
 def _together(use: NDArray[np.int64], apart: int | None) -> list[slice]:

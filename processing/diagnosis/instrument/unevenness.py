@@ -49,10 +49,10 @@ class Evenness:
             if tiles is None or not candidate.acts(k, problem.wavelengths_nm[k]):
                 continue
             rows, c = self._at(k, local)
-            there, more = self._at(k, moved)
+            moved_rows, more = self._at(k, moved)
             dc = (more - c) / STEP
             projected, used = self._projected(k, tiles, rows, c, dc=dc)
-            slope, power = projected.of_each((there - rows) / STEP, dc[used])
+            slope, power = projected.of_each((moved_rows - rows) / STEP, dc[used])
             smooth = np.vstack([np.ones(tiles.x.size), field_terms(tiles.x, tiles.y)])
             pull = smooth @ slope
             out += float(pull @ np.linalg.pinv((smooth * power) @ smooth.T, hermitian=True) @ pull)
@@ -71,11 +71,11 @@ class Evenness:
     ) -> tuple[Projected, NDArray[np.int64]]:
         """The tiles with the counts corrected, and the features they have: what a shift leaves seems to vary."""
         problem, _ = self._near
-        asked = tuple(np.flatnonzero(np.any(c, axis=1) | np.any(dc, axis=1)).tolist())
-        if (k, asked) not in self._parts:
-            known, z, noise = features_of_tiles(problem.captures[k], problem.moments[k], tiles, asked)
-            used = np.array(known)
+        numbers = tuple(np.flatnonzero(np.any(c, axis=1) | np.any(dc, axis=1)).tolist())
+        if (k, numbers) not in self._parts:
+            columns, z, noise = features_of_tiles(problem.captures[k], problem.moments[k], tiles, numbers)
+            used = np.array(columns)
             around = used >= len(FEATURES) - DERIVATIVES
             wide = np.broadcast_to(rows, (tiles.x.size, *rows.shape))
-            self._parts[k, asked] = Projected(z, noise, wide, c[None, used], around=around), used
-        return self._parts[k, asked]
+            self._parts[k, numbers] = Projected(z, noise, wide, c[None, used], around=around), used
+        return self._parts[k, numbers]

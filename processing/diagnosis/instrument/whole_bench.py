@@ -97,28 +97,28 @@ class WholeBench:
         if self.whole.noise_known:
             start = Space(tuple(fixed))
             self.whole.level_noise(start, self._values_at_start(start))
-        found = self._posterior([*fixed, *plain], fixed)
-        if too_many := self.as_many_as_intensities(found, TAKES_PART):
+        posterior = self._posterior([*fixed, *plain], fixed)
+        if too_many := self.as_many_as_intensities(posterior, TAKES_PART):
             self.say(f"without {', '.join(c.label for c in too_many)}: it would be a value for each intensity")
             plain = [c for c in plain if c not in too_many]
-            found = self._posterior([*fixed, *plain], fixed)
-        found = self._with_what_scatters_so(found, fixed)
+            posterior = self._posterior([*fixed, *plain], fixed)
+        posterior = self._with_what_scatters_so(posterior, fixed)
         fields = [c for c in self.pool if c.effect.varies_over_image]
         if fields and not self.whole.holds_out_states:
             # What the noise seemed to speak against may be right beside what varies over the image.
-            beside = self._with_fields(found, fixed, plain, fields)
-            found = found if beside is found else self._with_what_scatters_so(beside, fixed)
+            with_fields = self._with_fields(posterior, fixed, plain, fields)
+            posterior = posterior if with_fields is posterior else self._with_what_scatters_so(with_fields, fixed)
         # Behind a bent response the noise that counts should have is wrong by percents.
-        if self.whole.noise_known and self._adopt_noise(*applied(found, self.base)):
+        if self.whole.noise_known and self._adopt_noise(*applied(posterior, self.base)):
             self.say("the same with the noise that this light has")
-            found = self._posterior(list(found.space.candidates), fixed, found)
-        return found
+            posterior = self._posterior(list(posterior.space.candidates), fixed, posterior)
+        return posterior
 
     def _adopt_noise(self, space: Space, values: Array) -> bool:
-        taken = self.whole.adopt_noise(space, values)
-        if taken and self.whole is not self.problem:
+        is_adopted = self.whole.adopt_noise(space, values)
+        if is_adopted and self.whole is not self.problem:
             self.problem.adopt_noise(space, values)
-        return taken
+        return is_adopted
 
     def _with_what_scatters_so(self, found: Posterior, fixed: Sequence[Candidate]) -> Posterior:
         """Without corrections of the counts whose light would scatter otherwise than the counts do.
@@ -131,10 +131,10 @@ class WholeBench:
         while against := self._refuted_by_scatter(*applied(found, self.base)):
             worst = min(against, key=lambda c: against[c])
             self.say(f"the noise speaks against {worst.label}")
-            other = self._posterior([c for c in found.space.candidates if c != worst], fixed, found)
-            if not other.score > found.score + against[worst]:
+            trial = self._posterior([c for c in found.space.candidates if c != worst], fixed, found)
+            if not trial.score > found.score + against[worst]:
                 break
-            found = other
+            found = trial
         return found
 
     def _refuted_by_scatter(self, space: Space, values: Array) -> dict[Candidate, float]:
@@ -183,11 +183,11 @@ class WholeBench:
             for m in found.members[g]
             if found.space.candidates[m].effect.per_state
         ]
-        kept: list[Candidate] = []
+        valid: list[Candidate] = []
         for candidate in sorted(per_state, key=lambda c: not c.effect.of_source):
-            if all(self._has_room(where, [*kept, candidate]) for where in map(self._seen_by, [*kept, candidate])):
-                kept.append(candidate)
-        return set(per_state) - set(kept)
+            if all(self._has_room(where, [*valid, candidate]) for where in map(self._seen_by, [*valid, candidate])):
+                valid.append(candidate)
+        return set(per_state) - set(valid)
 
     def _seen_by(self, candidate: Candidate) -> frozenset[int]:
         return frozenset(k for k, nm in enumerate(self.whole.wavelengths_nm) if candidate.acts(k, nm))
@@ -197,12 +197,12 @@ class WholeBench:
 
         Angles that several captures share are told by all of them.
         """
-        told = 0
+        count = 0
         for data in (self.whole.captures[k] for k in captures):
             if self.whole.noise_known and data.usable.sum() > 1:
                 return True
-            told += len(self.whole.model.channels) - (self.whole.model.projects_source and data.sample is not None)
-        return sum(self._seen_by(c) <= captures for c in values) < told
+            count += len(self.whole.model.channels) - (self.whole.model.projects_source and data.sample is not None)
+        return sum(self._seen_by(c) <= captures for c in values) < count
 
     def _posterior(
         self, candidates: Sequence[Candidate], fixed: Sequence[Candidate], old: Posterior | None = None
@@ -236,10 +236,10 @@ class WholeBench:
         """The posterior of all with values that vary over the image, if they promise something beside the others."""
         space, values = applied(found, self.base)
         unit = self._least_unit(found)
-        both = Space((*space.candidates, *fields))
-        sums = self.whole.sums(both, np.append(values, np.zeros(both.size - space.size)))
-        parts = dict(both.pairs)
-        gains = {c: score(sums, space.size, parts[c], prior(both))[0] / unit for c in fields}
+        joint = Space((*space.candidates, *fields))
+        sums = self.whole.sums(joint, np.append(values, np.zeros(joint.size - space.size)))
+        parts = dict(joint.pairs)
+        gains = {c: score(sums, space.size, parts[c], prior(joint))[0] / unit for c in fields}
         best = max(gains, key=lambda c: gains[c])
         if gains[best] < 2 * NEEDED:
             return found

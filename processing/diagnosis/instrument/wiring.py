@@ -56,9 +56,9 @@ def miswired(problem: InstrumentProblem, declared: InstrumentModel | None = None
         return None
     nothing, none = Space(()), np.zeros(0)
     mistakes = [*_mistakes(problem), *_other_wavelengths(problem, declared)]
-    found = _best(mistakes, [_left(w.problem, nothing, none) for w in mistakes], _left(problem, nothing, none))
+    wiring = _best(mistakes, [_left(w.problem, nothing, none) for w in mistakes], _left(problem, nothing, none))
     # Plates that are far off, or another mount, may come nearer to a mistake than to what is declared.
-    return None if found is None or _fits_better(problem, found.problem) else found
+    return None if wiring is None or _fits_better(problem, wiring.problem) else wiring
 
 
 def _fits_better(problem: InstrumentProblem, other: InstrumentProblem) -> bool:
@@ -80,8 +80,8 @@ def miswired_train(problem: InstrumentProblem, declared: InstrumentModel | None 
 
 
 def _best(mistakes: Sequence[Wiring], lefts: Sequence[float], start: float) -> Wiring | None:
-    found = [(left, k) for k, left in enumerate(lefts) if left < start / WIRING and start - left > 2 * NEEDED]
-    return mistakes[min(found)[1]] if found else None
+    fits = [(chi2, k) for k, chi2 in enumerate(lefts) if chi2 < start / WIRING and start - chi2 > 2 * NEEDED]
+    return mistakes[min(fits)[1]] if fits else None
 
 
 def _left(problem: InstrumentProblem, space: Space, values: Array) -> float:
@@ -106,9 +106,9 @@ def _mistakes(problem: InstrumentProblem) -> Iterator[Wiring]:
         yield Wiring("the two axes are in each other's place", change, _with_values(problem, elements))
     groups: list[tuple[str, ...]] = [*((a,) for a in axes), tuple(axes)]
     for group in dict.fromkeys(groups):
-        which = " and ".join(repr(a) for a in group)
-        yield _scaled(problem, group, 0.5, f"angles of {which} are told in half degrees")
-        yield _scaled(problem, group, 2.0, f"angles of {which} are told in units of two degrees")
+        names = " and ".join(repr(a) for a in group)
+        yield _scaled(problem, group, 0.5, f"angles of {names} are told in half degrees")
+        yield _scaled(problem, group, 2.0, f"angles of {names} are told in units of two degrees")
     for axis in axes:
         for name, factor in GEARS.items():
             yield _scaled(problem, (axis,), factor, f"axis {axis!r} was driven with a ratio of {name}")
@@ -127,13 +127,13 @@ def _mistakes(problem: InstrumentProblem) -> Iterator[Wiring]:
 
 def _other_wavelengths(problem: InstrumentProblem, declared: InstrumentModel | None) -> Iterator[Wiring]:
     """The light is of another wavelength than the captures say, of those that the instrument file has."""
-    told = set(problem.wavelengths_nm)
-    for wavelength in (declared.wavelengths_nm or ()) if declared is not None and len(told) == 1 else ():
-        if wavelength not in told:
+    wavelengths = set(problem.wavelengths_nm)
+    for wavelength in (declared.wavelengths_nm or ()) if declared is not None and len(wavelengths) == 1 else ():
+        if wavelength not in wavelengths:
             at = declared.nominal_at(wavelength)  # type: ignore[union-attr]
-            what = f"the light is of {wavelength:g} nm, not of {told.copy().pop():g}"
+            text = f"the light is of {wavelength:g} nm, not of {wavelengths.copy().pop():g}"
             change = f"in the capture (or the states file), wavelength_nm: {wavelength:g}"
-            yield Wiring(what, change, _changed(problem, lambda _, m=at: m))  # type: ignore[misc]
+            yield Wiring(text, change, _changed(problem, lambda _, m=at: m))  # type: ignore[misc]
 
 
 def _scaled(problem: InstrumentProblem, axes: tuple[str, ...], factor: float, what: str) -> Wiring:
@@ -146,7 +146,7 @@ def _turned_mosaics(problem: InstrumentProblem) -> Iterator[Wiring]:
     model = problem.model
     layout = np.array(model.mosaic)
     by_name = {c.name: c for c in model.channels}
-    for what, turned in (
+    for turn, turned in (
         ("turned by 90 degrees", np.rot90(layout)),
         ("turned by 180 degrees", np.rot90(layout, 2)),
         ("turned by 270 degrees", np.rot90(layout, 3)),
@@ -157,7 +157,7 @@ def _turned_mosaics(problem: InstrumentProblem) -> Iterator[Wiring]:
         # The pixels that were read as channel a show what channel b shows.
         channels = tuple(by_name[now[c.name]].model_copy(update={"name": c.name}) for c in model.channels)
         new = _changed(problem, lambda m, c=channels: m.model_copy(update={"channels": c}))  # type: ignore[misc]
-        yield Wiring(f"the image is {what}", f"in the instrument file, mosaic: {turned.tolist()}", new)
+        yield Wiring(f"the image is {turn}", f"in the instrument file, mosaic: {turned.tolist()}", new)
 
 
 def _changed(problem: InstrumentProblem, change: Callable[[InstrumentModel], InstrumentModel]) -> InstrumentProblem:

@@ -68,11 +68,11 @@ def diagnose_surface(problem: SurfaceProblem, material: str, say: Say) -> Surfac
     say("testing what is left over")
     solved, captures = solution(problem, found, Space(()), np.zeros(0)), range(len(problem.captures))
     found, covariance, wider = as_wide_as_the_valley(problem, found, solved)
-    (before, _), (after, left) = (
+    (before, _), (after, excess) = (
         zip(*(structure(problem, k, at, fit.values) for k in captures), strict=True) for at, fit in solved.ends
     )
     has_structure = any(map(beyond_chance, after))
-    names = names_of(found, wider, sum(left) if has_structure else 0.0)
+    names = names_of(found, wider, sum(excess) if has_structure else 0.0)
     judgement = Judgement(
         named=bool(names.named),
         sure=bool(names.named),
@@ -94,7 +94,7 @@ def names_of(found: Posterior, wider: Array, left: float) -> Names:
     doubt = with_parts(found, likely, {c: AT_BOUND for c in likely if at_bound(c)}, left=left, noise_known=True)
     named = []
     for cause in (c for c in likely if c not in doubt):
-        factors = [np.outer(wider[part[one]], wider[part[one]]) for one in cause.candidates]
+        factors = [np.outer(wider[part[c]], wider[part[c]]) for c in cause.candidates]
         widened = tuple(v * f for v, f in zip(cause.covariance, factors, strict=True))
         named.append(replace(cause, covariance=widened))
     return Names(tuple(named), {})
@@ -136,38 +136,38 @@ def _told(
     before: Sequence[dict[str, float]],
     after: Sequence[dict[str, float]],
 ) -> SurfaceDiagnosis:
-    kept, names, verdict = answer.kept, answer.names, answer.judgement.verdict
+    final, names, verdict = answer.kept, answer.names, answer.judgement.verdict
     in_doubt, rivals = _degeneracy_in_doubt(problem, answer.solved), [c for each in names.rivals for c in each]
 
     def next_step() -> str:
-        said = recommended(problem, kept.space, kept.fit, rivals, verdict=verdict, before=before)
-        return said + (CONFIRM if names.named and in_doubt else "")
+        text = recommended(problem, final.space, final.fit, rivals, verdict=verdict, before=before)
+        return text + (CONFIRM if names.named and in_doubt else "")
 
-    told = answer.told(
+    fields = answer.told(
         recommended=next_step,
         descriptions=[
             f"{data.name}: {line}"
             for data, tests in zip(problem.captures, after, strict=True)
             for line in in_words(tests)
         ],
-        captures=[_capture(problem, k, kept, before[k], after=after[k]) for k in range(len(problem.captures))],
+        captures=[_capture(problem, k, final, before[k], after=after[k]) for k in range(len(problem.captures))],
         unseen=unobservable(problem, answer.found),
         calibrated={},
         lasts=True,
     )
     if in_doubt:
         more = {"answer": "one of"}
-        told["effects"] = tuple(
+        fields["effects"] = tuple(
             e.model_copy(update=more | {"indistinguishable_from": (*e.indistinguishable_from, DEGENERACY)})
-            for e in told["effects"]
+            for e in fields["effects"]
         )
     first, last = (
-        [quantities(problem, k, space, fit.values) for k in range(len(problem.captures))] for space, fit in kept.ends
+        [quantities(problem, k, space, fit.values) for k in range(len(problem.captures))] for space, fit in final.ends
     )
     return SurfaceDiagnosis(
-        **told,
+        **fields,
         material=material,
-        constants=constants(problem, kept.space, kept.fit.values),
+        constants=constants(problem, final.space, final.fit.values),
         quantities_before=tuple(q for q, _ in first),
         quantities_after=tuple(q for q, _ in last),
         xi0_change=tuple(rmsd(b[np.isfinite(b)]) for b in (y - x for (_, x), (_, y) in zip(first, last, strict=True))),
@@ -213,8 +213,8 @@ def _apart(problem: SurfaceProblem, space: Space, fit: Fit, rivals: Sequence[Can
         alone = Space((candidate,))
         parts = []
         for k in range(len(problem.captures)):
-            here = problem.pixels(k, Space(()), np.zeros(0))
-            parts.append(problem.derivatives(k, alone, np.zeros(alone.size), here)[0].reshape(alone.size, -1))
+            pixels = problem.pixels(k, Space(()), np.zeros(0))
+            parts.append(problem.derivatives(k, alone, np.zeros(alone.size), pixels)[0].reshape(alone.size, -1))
         signatures.append(np.concatenate(parts, axis=1).T)
     return least_apart(signatures)
 
@@ -280,7 +280,7 @@ def diagnose_object(
             data.append(read_surface(capture, model.at(capture.header.wavelength_nm), view, material))
     wavelengths = {c.wavelength_nm for c in data}
     if len(wavelengths) != 1:
-        found = ", ".join(f"{w:g}" for w in sorted(wavelengths))
-        raise CaptureError(f"the captures are at {found} nm; effects differ with wavelength. Give one wavelength.")
+        listed = ", ".join(f"{w:g}" for w in sorted(wavelengths))
+        raise CaptureError(f"the captures are at {listed} nm; effects differ with wavelength. Give one wavelength.")
     problem = SurfaceProblem(model.at(wavelengths.pop()), data)
     return diagnose_surface(problem, material.name, say), problem

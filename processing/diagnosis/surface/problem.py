@@ -100,9 +100,9 @@ class SurfaceProblem:
         out = []
         for k, data in enumerate(self.captures):
             w = self.rows(k, Space(()), np.zeros(0))
-            here = data.kept(data.polarized(w[:, 0]))
-            if len(here.y) >= FEWEST_OF_MANY:
-                out.append(here)
+            subset = data.kept(data.polarized(w[:, 0]))
+            if len(subset.y) >= FEWEST_OF_MANY:
+                out.append(subset)
         if not out:
             raise ProcessError(
                 "no polarization stands out of the noise of these captures, so they say nothing about the dominant "
@@ -224,20 +224,20 @@ class SurfaceProblem:
         size = space.size if derivatives else 0
         out = Sums.empty(self.folds, size, len(self.captures))
         for k, data in enumerate(self.captures):
-            part, here = Sums.empty(self.folds, size), self.pixels(k, space, values)
-            expected = np.sum(here.free * self.noise[k], axis=1)
-            square = np.sum((here.residual * self.sigma[k]) ** 2, axis=1) / float(np.mean(data.y)) ** 2
+            part, px = Sums.empty(self.folds, size), self.pixels(k, space, values)
+            expected = np.sum(px.free * self.noise[k], axis=1)
+            square = np.sum((px.residual * self.sigma[k]) ** 2, axis=1) / float(np.mean(data.y)) ** 2
             for total, each in (
-                (part.excess, np.sum(here.residual**2, axis=1) - expected),
+                (part.excess, np.sum(px.residual**2, axis=1) - expected),
                 (part.freedom, expected),
                 (part.square, square),
-                (part.count, here.free.sum(axis=1)),
+                (part.count, px.free.sum(axis=1)),
             ):
                 np.add.at(total, data.fold, each)
-            d, less = self.derivatives(k, space, values, here) if size else (np.zeros((0, *here.residual.shape)),) * 2
+            d, less = self.derivatives(k, space, values, px) if size else (np.zeros((0, *px.residual.shape)),) * 2
             for fold in range(self.folds if size else 0):
                 mine = d[:, data.fold == fold].reshape(size, -1)
-                part.gradient[fold] = mine @ here.residual[data.fold == fold].reshape(-1)
+                part.gradient[fold] = mine @ px.residual[data.fold == fold].reshape(-1)
                 part.gradient[fold] -= less[:, data.fold == fold].sum(axis=1) / 2
                 part.curvature[fold] = mine @ mine.T
             out.add(k, part, space.acting(k, data.wavelength_nm))
@@ -272,11 +272,11 @@ class SurfaceProblem:
         """Part (K, K) of the curvature that comes from the noise of alpha_0 and tells nothing about the values."""
         out = np.zeros((space.size, space.size))
         for k in range(len(self.captures)):
-            here = self.pixels(k, space, values)
-            free = (1 - here.hold) / np.where(here.strength > 0, here.strength, np.inf)
+            pixels = self.pixels(k, space, values)
+            free = (1 - pixels.hold) / np.where(pixels.strength > 0, pixels.strength, np.inf)
             moved = self._moved(k, space, values)
-            d = [here.outside(columns - here.columns) * free[:, None] / step for step, columns, _, _ in moved]
-            flat = np.reshape(d, (space.size, here.residual.size))
+            d = [pixels.outside(columns - pixels.columns) * free[:, None] / step for step, columns, _, _ in moved]
+            flat = np.reshape(d, (space.size, pixels.residual.size))
             out += flat @ flat.T
         return out
 
@@ -299,9 +299,9 @@ def structure(problem: SurfaceProblem, k: int, space: Space, values: Array) -> t
     Sums over tiles of the object, split into what some Mueller matrix could cause and what none could, which speaks
     against the instrument's model and not against the reflectance.
     """
-    here, data = problem.pixels(k, space, values), problem.captures[k]
-    r, noise = here.residual, problem.noise[k] * here.free
-    found = {"sum of squares": (float(np.sum(r**2) - noise.sum()), float(np.sqrt(2 * noise.sum())))}
+    pixels, data = problem.pixels(k, space, values), problem.captures[k]
+    r, noise = pixels.residual, problem.noise[k] * pixels.free
+    tests = {"sum of squares": (float(np.sum(r**2) - noise.sum()), float(np.sqrt(2 * noise.sum())))}
     basis = range_of(problem.rows(k, space, values) / np.mean(problem.sigma[k], axis=0)[:, None])
     rows, rank = basis.shape
     tiles = np.unique(data.tile)
@@ -316,5 +316,5 @@ def structure(problem: SurfaceProblem, k: int, space: Space, values: Array) -> t
             # Sums over as many pixels as a tile has count as one.
             size = len(r) / tiles.size
             deviation = np.sqrt(2 * directions * np.sum(level**2))
-            found[name] = float(square - directions * level.sum()) / size, float(deviation) / size
-    return in_deviations(found)
+            tests[name] = float(square - directions * level.sum()) / size, float(deviation) / size
+    return in_deviations(tests)

@@ -37,13 +37,13 @@ class SurfaceQuantities(Section):
 
 def quantities(problem: SurfaceProblem, k: int, space: Space, values: Array) -> tuple[SurfaceQuantities, Array]:
     """What the model with these values says of a capture, and xi0 of its pixels (P,)."""
-    here, data = problem.pixels(k, space, values), problem.captures[k]
-    xi0 = _xi0(here)
+    pixels, data = problem.pixels(k, space, values), problem.captures[k]
+    xi0 = _xi0(pixels)
     good = xi0[np.isfinite(xi0)]
-    ideal = data.y - here.residual * problem.sigma[k]
+    ideal = data.y - pixels.residual * problem.sigma[k]
     drawn = np.random.default_rng(0).normal(ideal, problem.sigma[k])
     measured, expected = (dominant_errors(problem, k, space, values, y=y) for y in (data.y, drawn))
-    said = SurfaceQuantities(
+    result = SurfaceQuantities(
         psi_deg=None if measured is None else rmsd(measured[0]),
         magnitude_percent=None if measured is None else rmsd(measured[1]),
         psi_noise_deg=None if expected is None else rmsd(expected[0]),
@@ -51,7 +51,7 @@ def quantities(problem: SurfaceProblem, k: int, space: Space, values: Array) -> 
         xi0=float(np.median(good)) if good.size else float("nan"),
         unphysical=float(np.mean((good < 0.25) | (good > 1))) if good.size else float("nan"),
     )
-    return said, xi0
+    return result, xi0
 
 
 def xi0_of(problem: SurfaceProblem, k: int, space: Space, values: Array) -> Array:
@@ -96,19 +96,19 @@ def change_of_xi0(problem: SurfaceProblem, solved: Solution, covariance: Array) 
     Slopes at what was found do not tell it: the model is far from linear, and values have bounds.
     """
     space, values = solved.space, solved.fit.values
-    found = _all_xi0(problem, space, values)
-    change = found - _all_xi0(problem, space, np.zeros(space.size))
+    xi0 = _all_xi0(problem, space, values)
+    change = xi0 - _all_xi0(problem, space, np.zeros(space.size))
     if not np.isfinite(change).any():
         return None
     size = float(np.sqrt(_mean(change**2)))
-    along, whole = 0.0, 0.0
+    along, total = 0.0, 0.0
     lower, upper = space.joined("lower"), space.joined("upper")
     variance, axes = np.linalg.eigh(covariance)
-    for one in (np.sqrt(np.maximum(variance, 0.0)) * axes).T:
-        ends = [_all_xi0(problem, space, np.clip(values + sign * one, lower, upper)) - found for sign in (1, -1)]
-        whole += sum(_mean(end**2) for end in ends) / 2
+    for axis in (np.sqrt(np.maximum(variance, 0.0)) * axes).T:
+        ends = [_all_xi0(problem, space, np.clip(values + sign * axis, lower, upper)) - xi0 for sign in (1, -1)]
+        total += sum(_mean(end**2) for end in ends) / 2
         along += sum(_mean(end * change) ** 2 for end in ends) / 2 / max(size, 1e-300) ** 2
-    return PredictedChange(float(np.hypot(size, np.sqrt(whole))), float(np.sqrt(whole)), size, size, float(along**0.5))
+    return PredictedChange(float(np.hypot(size, np.sqrt(total))), float(np.sqrt(total)), size, size, float(along**0.5))
 
 
 def _all_xi0(problem: SurfaceProblem, space: Space, values: Array) -> Array:

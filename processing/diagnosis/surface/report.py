@@ -85,8 +85,8 @@ def states_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> Any
     figure = Picture(figsize=(11, 2.6), layout="constrained")
     axis = figure.subplots()
     for name, (space, fit) in zip(("before", "after"), judged.found.ends, strict=True):
-        here = problem.pixels(k, space, fit.values)
-        rms = np.sqrt(np.mean(here.residual**2, axis=0) / np.mean(here.free * problem.noise[k], axis=0))
+        pixels = problem.pixels(k, space, fit.values)
+        rms = np.sqrt(np.mean(pixels.residual**2, axis=0) / np.mean(pixels.free * problem.noise[k], axis=0))
         axis.plot(rms, "o-", ms=3, label=name)
     axis.axhline(1.0, color="0.6", lw=0.8)
     axis.set_ylim(bottom=0)

@@ -139,7 +139,7 @@ class SurfaceView:
         if not changes.support:
             return None
         # Of what else may be wrong only the material counts here: the rest changes a small term by a little.
-        one = ReflectanceChanges(
+        material = ReflectanceChanges(
             diffuse_a=changes.diffuse_a,
             diffuse_log_b=changes.diffuse_log_b,
             index=changes.index,
@@ -147,7 +147,7 @@ class SurfaceView:
             support_rad=changes.support_rad,
             support_log_depth=changes.support_log_depth,
         )
-        below = _once(self._below, astuple(one), lambda: self._from_below(one))
+        below = _once(self._below, astuple(material), lambda: self._from_below(material))
         slope = 1 + _disc(0.0, 1.0)[:, ::2] @ np.array(changes.support_slope)
         column = np.einsum("l,t,ltpi->pi", [1.0, changes.support_law], slope, below)
         out = np.zeros((len(self.points), 4, 4))

@@ -23,15 +23,15 @@ def corrected_material(
     material: first_surface.Model | polarized_diffuse.Model, diagnosis: SurfaceDiagnosis
 ) -> polarized_diffuse.Model:
     """The material with the constants found at the diagnosis' wavelength; those at others stay as they are."""
-    known: dict[float, polarized_diffuse.Constants] = {}
+    constants: dict[float, polarized_diffuse.Constants] = {}
     for nm, c in material.constants.items():
         a, b = (c.a, c.b) if isinstance(c, polarized_diffuse.Constants) else (0.0, 2.0)
-        known[nm] = polarized_diffuse.Constants(n=c.n, k=c.k, a=a, b=b)
-    key = next((nm for nm in known if abs(nm - diagnosis.wavelengths_nm[0]) < SAME_NM), diagnosis.wavelengths_nm[0])
-    known[key] = polarized_diffuse.Constants(**diagnosis.constants)
+        constants[nm] = polarized_diffuse.Constants(n=c.n, k=c.k, a=a, b=b)
+    key = next((nm for nm in constants if abs(nm - diagnosis.wavelengths_nm[0]) < SAME_NM), diagnosis.wavelengths_nm[0])
+    constants[key] = polarized_diffuse.Constants(**diagnosis.constants)
     names = ", ".join(c.name for c in diagnosis.captures)
     source = f"diagnose, {diagnosis.wavelengths_nm[0]:g} nm, from {names}"
-    return polarized_diffuse.Model(name=f"{material.name}, corrected", source=source, constants=known)
+    return polarized_diffuse.Model(name=f"{material.name}, corrected", source=source, constants=constants)
 
 
 def corrected_geometry(view: ViewingGeometry, diagnosis: SurfaceDiagnosis) -> ViewingGeometry:
@@ -84,8 +84,8 @@ def write_surface(
         changed = instrument.model_copy(update={"effects": (*instrument.effects, *of_instrument)})
         models.append((for_instrument, changed))
     if not models:
-        found = f" {', '.join(sorted(kinds))} has no place in a file: mend it at the bench." if kinds else ""
-        raise WriteError(f"nothing was found that could go into {path}; it was not written.{found}")
+        hint = f" {', '.join(sorted(kinds))} has no place in a file: mend it at the bench." if kinds else ""
+        raise WriteError(f"nothing was found that could go into {path}; it was not written.{hint}")
     for target, _ in models:
         require_new(target)
     head = file_head(f"Written by `diagnose --reflectance`: {diagnosis.verdict}.", note)

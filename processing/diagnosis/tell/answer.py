@@ -116,10 +116,10 @@ def combinations(found: Posterior, solved: Solution) -> tuple[Combination, ...]:
             names += [candidate.label if single else f"{candidate.label} {p.name}" for p in candidate.parameters]
             units += [p.unit for p in candidate.parameters]
     typical = found.space.joined("typical")[at]
-    told = []
+    result = []
     for tie in ties(found.values[at], found.covariance[np.ix_(at, at)], typical):
         first = int(tie.index[np.argmin(np.abs(tie.weights - 1))])
-        told.append(
+        result.append(
             Combination(
                 weights={names[i]: float(w) for i, w in zip(tie.index, tie.weights, strict=True)},
                 value=tie.value,
@@ -128,7 +128,7 @@ def combinations(found: Posterior, solved: Solution) -> tuple[Combination, ...]:
                 open_by={names[i]: float(v) for i, v in zip(tie.index, tie.open_by, strict=True)},
             )
         )
-    return tuple(told)
+    return tuple(result)
 
 
 def error(problem: Asked, solved: Solution, out: HeldOut, k: int | None = None) -> Error:
@@ -151,8 +151,8 @@ def stretch(problem: Asked, solved: Solution, k: int | None = None) -> float:
     """By how much a bend of the response that is undone stretches noise, and residual, relative to the signal."""
     if not problem.noise_known:
         return 1.0
-    taken = problem.noise_floor(solved.base, solved.before_fit.values, k)
-    return problem.noise_floor(solved.space, solved.fit.values, k) / taken if taken > 0 else 1.0
+    before = problem.noise_floor(solved.base, solved.before_fit.values, k)
+    return problem.noise_floor(solved.space, solved.fit.values, k) / before if before > 0 else 1.0
 
 
 def left_without(problem: Asked, solved: Solution, effects: Collection[Candidate]) -> HeldOut:
@@ -174,18 +174,18 @@ def told_effects(
     if not any(c in solved.space.candidates for c in (*cause.candidates, *cause.alternatives)):
         not_applied = not_applied or doubt or "it is not needed in addition to the other causes"
     answer, probability = told_answer(cause, doubt)
-    told = []
+    effects = []
     # Of one with values of its own in every capture, those captures are told in which it shows.
     each = [
         at
-        for found in zip(cause.candidates, cause.values, cause.covariance, strict=True)
-        for at in found[0].by_wavelength(*found[1:])
+        for entry in zip(cause.candidates, cause.values, cause.covariance, strict=True)
+        for at in entry[0].by_wavelength(*entry[1:])
     ]
     sizes = [shown(values, covariance) for _, values, covariance in each]
     for (candidate, values, covariance), size in zip(each, sizes, strict=True):
         if size < min(1.0, max(sizes)):
             continue
-        told.append(
+        effects.append(
             FoundEffect(
                 kind=candidate.kind,
                 element=candidate.place or None,
@@ -204,19 +204,19 @@ def told_effects(
                 not_applied=not_applied,
             )
         )
-    return told
+    return effects
 
 
 def told_switches(problem: Asked, solved: Solution) -> list[FoundEffect]:
     """Pixels that are left out because what they say is another thing than the others say."""
-    told = []
+    effects = []
     for candidate, part in solved.space.pairs:
         if candidate.effect.is_switch:
             value, never = solved.fit.values[part], np.zeros((1, 1))
             gain = left_without(problem, solved, (candidate,)).excess - solved.after.excess
             cause = Cause((candidate,), (value,), (never,), probability=1.0, log_odds=gain / 2, alternatives=())
-            told += told_effects(problem, solved, cause, None, not_applied=None) if gain > 2 * NEEDED else []
-    return told
+            effects += told_effects(problem, solved, cause, None, not_applied=None) if gain > 2 * NEEDED else []
+    return effects
 
 
 def _wavelength(problem: Asked, candidate: Candidate) -> float | None:
@@ -250,7 +250,7 @@ def ranking(found: Posterior, before: HeldOut) -> tuple[Ranked, ...]:
 
 def unobservable(problem: Asked, found: Posterior) -> list[Candidate]:
     """Candidates about which the captures say nothing, the nominal values being free."""
-    told, always = information(found)
+    precision, always = information(found)
     out = []
     for candidate, part in found.space.pairs:
         if candidate.state_chosen or candidate.effect.is_switch or np.isin(part.start, always):
@@ -258,10 +258,10 @@ def unobservable(problem: Asked, found: Posterior) -> list[Candidate]:
         least = np.full(candidate.size, SEEN)
         if candidate.reaches_around:
             # Noise alone has slopes too, from one pixel to the next, which a shift would change.
-            one = Space((candidate,))
-            noise = np.diag(problem.noise_information(one, np.zeros(one.size))) * candidate.typical**2
+            alone = Space((candidate,))
+            noise = np.diag(problem.noise_information(alone, np.zeros(alone.size))) * candidate.typical**2
             least = np.maximum(least, SMALL * noise)
-        if np.all(told[part] < least):
+        if np.all(precision[part] < least):
             out.append(candidate)
     return out
 
@@ -273,7 +273,7 @@ def checks(problem: Asked, solved: Solution) -> tuple[Check, ...]:
     for k, data in enumerate(problem.captures):
         if several:
             # The sum decides; what became of each is told also where nothing is written.
-            old, new = (100 * found.of(k).rms for found in (solved.before, solved.after))
+            old, new = (100 * held_out.of(k).rms for held_out in (solved.before, solved.after))
             name = f"rms on held-out data of {data.name} at {data.wavelength_nm:g} nm, percent"
             out.append(Check(name=name, before=old, after=new, holds=True))
         before, after = (problem.rows(k, space, fit.values) for space, fit in solved.ends)
@@ -326,7 +326,7 @@ class Answer:
         lasts : whether the correction may be used for later captures.
         uncertain : how wrong M may be still.
         """
-        problem, solved, kept, names = self.problem, self.solved, self.kept, self.names
+        problem, solved, final, names = self.problem, self.solved, self.kept, self.names
         verdict, ranked = self.judgement.verdict, ranking(self.found, solved.before)
         # What makes the residual worse is no cause, however well it fits.
         worse, refused = refusal(self.judgement.figures), self.judgement.refused
@@ -334,8 +334,8 @@ class Answer:
         return {
             "verdict": verdict,
             "error_before": error(problem, solved, solved.before),
-            "error_after": error(problem, kept, kept.after),
-            "noise_floor_percent": floor(problem, kept),
+            "error_after": error(problem, final, final.after),
+            "noise_floor_percent": floor(problem, final),
             "effects": (
                 *(
                     e
@@ -365,26 +365,24 @@ class Answer:
 
     def _correction(self, lasts: bool, uncertain: tuple[SystematicError, MuellerError] | None) -> Correction:
         """What a file would hold: means, with the spread over the sets; for these captures alone unless it `lasts`."""
-        found, solved, captures = self.found, self.solved, self.problem.captures
-        part = dict(found.space.pairs)
-        chance = {
-            found.space.candidates[m]: p for g, p in enumerate(found.samples.probability) for m in found.members[g]
-        }
+        post, solved, captures = self.found, self.solved, self.problem.captures
+        part = dict(post.space.pairs)
+        chance = {post.space.candidates[m]: p for g, p in enumerate(post.samples.probability) for m in post.members[g]}
         effects = []
         for candidate, where in solved.space.pairs if self.any_cause else ():
             if candidate in solved.base.candidates:
                 continue
-            covariance = found.covariance[part[candidate], part[candidate]]
-            for one, values, own in candidate.by_wavelength(solved.fit.values[where], covariance):
+            covariance = post.covariance[part[candidate], part[candidate]]
+            for single, values, block in candidate.by_wavelength(solved.fit.values[where], covariance):
                 effects.append(
                     AppliedEffect(
-                        kind=one.kind,
-                        element=one.place or None,
-                        parameters=one.stored(values, np.sqrt(np.maximum(np.diag(own), 0.0))),
+                        kind=single.kind,
+                        element=single.place or None,
+                        parameters=single.stored(values, np.sqrt(np.maximum(np.diag(block), 0.0))),
                         probability=float(chance[candidate]),
-                        captures=tuple(c.name for k, c in enumerate(captures) if one.acts(k, c.wavelength_nm)),
-                        scope=one.scope if lasts else "capture",
-                        wavelength_nm=_wavelength(self.problem, one),
+                        captures=tuple(c.name for k, c in enumerate(captures) if single.acts(k, c.wavelength_nm)),
+                        scope=single.scope if lasts else "capture",
+                        wavelength_nm=_wavelength(self.problem, single),
                     )
                 )
         stored, mueller = uncertain or (None, None)
@@ -392,7 +390,7 @@ class Answer:
             effects=tuple(effects),
             systematic=stored,
             mueller=mueller,
-            combinations=combinations(found, solved) if self.any_cause else (),
+            combinations=combinations(post, solved) if self.any_cause else (),
             checks=self.judgement.checks,
             refused=self.judgement.refused,
         )

@@ -72,8 +72,8 @@ def _effects(d: Diagnosis) -> list[list[str]]:
             sure = e.answer or ""
             if e.probability is not None:
                 sure += f", {e.probability:.3f}" if e.probability < 0.999 else ", over 0.999"
-            whole = (kind, place, sure, f"{e.evidence:.0f}", ", ".join(e.could_be))
-            first = whole if name == next(iter(e.parameters)) else ("",) * len(whole)
+            cells = (kind, place, sure, f"{e.evidence:.0f}", ", ".join(e.could_be))
+            first = cells if name == next(iter(e.parameters)) else ("",) * len(cells)
             # Non-breaking spaces: a number stays on one line with its error and unit.
             value = f"{p.told} {p.unit if p.unit != '1' else ''}".strip().replace(" ", "\u00a0")
             rows.append([*first[:2], name, value, *first[2:]])
