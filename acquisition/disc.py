@@ -150,10 +150,10 @@ class DiscProcess:
 
     def _dispatch(self) -> None:
         while (job := self._jobs.get()) is not None:
-            future, asked, frame = job
+            future, request, frame = job
             self._busy_since_s = time.monotonic()
             try:
-                self._line.send((*asked, self._shared(frame), _folder()))
+                self._line.send((*request, self._shared(frame), _folder()))
                 is_well, answer = self._line.recv()
             except (EOFError, ConnectionError):
                 self.has_ended = True

@@ -78,13 +78,13 @@ class CameraDevice(BlueskyDevice):
     def _configuration(self) -> dict[str, tuple[Any, str]]:
         camera = self.rig.require_camera()
         who = camera.describe()
-        told = {
+        configuration = {
             "exposure_s": (self.exposure_s, "s"),
             "serial_number": (who.serial_number, ""),
             "model": (who.model, ""),
         }
         gain_db = None if camera.configured is None else camera.configured.gain_db
-        return told | ({} if gain_db is None else {"gain_db": (gain_db, "dB")})
+        return configuration | ({} if gain_db is None else {"gain_db": (gain_db, "dB")})
 
     def configure(self, values: dict[str, float]) -> tuple[Readings, Readings]:
         """Change the exposure (`exposure_s`); returns the configuration before and after."""
@@ -136,8 +136,8 @@ class CameraDevice(BlueskyDevice):
 
     def read(self) -> Readings:
         """The frame that was taken last, unless it is in a file, and its mean in counts."""
-        told = self.tells_frames and not self._in_files
-        frame = {f"{self.name}_frame": self._frame} if told else {}
+        has_frame = self.tells_frames and not self._in_files
+        frame = {f"{self.name}_frame": self._frame} if has_frame else {}
         return readings(frame | {f"{self.name}_mean": float(self._frame.mean())})
 
     def describe(self) -> Readings:

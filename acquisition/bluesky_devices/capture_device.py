@@ -126,14 +126,14 @@ class CaptureDevice(BlueskyDevice):
 
     def _configuration(self) -> dict[str, tuple[Any, str]]:
         who = self.rig.require_camera().describe()
-        told: dict[str, tuple[Any, str]] = {
+        configuration: dict[str, tuple[Any, str]] = {
             "mode": (self.plan.mode, ""),
             "sample": (self.plan.sample.name or self.plan.sample.kind, ""),
             "wavelength_nm": (self.plan.wavelength_nm, "nm"),
             "camera_serial_number": (who.serial_number, ""),
         }
         exposure_s = self._number("exposure_s")
-        return told | ({} if math.isnan(exposure_s) else {"plan_exposure_s": (exposure_s, "s")})
+        return configuration | ({} if math.isnan(exposure_s) else {"plan_exposure_s": (exposure_s, "s")})
 
     def _run(self, run: Callable[..., Result], job: Job, path: Path) -> Result:
         refuse_failed(check_with_devices(job, self.rig, path.parent))

@@ -62,11 +62,11 @@ def require_same_campaign(folder: Path, now: dict[str, Any]) -> None:
     then = read_identity(folder)
     if then is None:
         return
-    found = list(dict.fromkeys(_found(then, now)))
-    if found:
+    changes = list(dict.fromkeys(_found(then, now)))
+    if changes:
         started = f"it was started with --rig {then.get('rig_file')}"
         raise Differs(
-            str(folder), [*found[:20], *([f"and {len(found) - 20} more"] if len(found) > 20 else []), started]
+            str(folder), [*changes[:20], *([f"and {len(changes) - 20} more"] if len(changes) > 20 else []), started]
         )
 
 

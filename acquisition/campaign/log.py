@@ -162,9 +162,9 @@ def read_index(folder: Path) -> dict[str, dict[str, Any]]:
 def entry_of(capture: CampaignCapture, path: Path) -> dict[str, Any]:
     """What the index says of a capture whose file is there. Raises CaptureError."""
     plan = capture.plan
-    with Capture(path) as there:
-        saturated = float(np.max(there.column("saturated_fraction"), initial=0.0))
-        status, states = there.status, len(there.done)
+    with Capture(path) as file:
+        saturated = float(np.max(file.column("saturated_fraction"), initial=0.0))
+        status, states = file.status, len(file.done)
     return {
         "status": status, "states": states, "file": path.name, "reference": capture.reference, "role": plan.role,
         "omega_deg": plan.omega_deg, "wavelength_nm": plan.wavelength_nm, "mode": plan.mode, "sample": plan.sample.name,

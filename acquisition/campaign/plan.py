@@ -107,19 +107,19 @@ class Campaign(FiniteSection):
         for reference in self.references:
             unknown = sorted(set(reference.modes) - set(self.plans))
             if unknown or not reference.modes:
-                known = ", ".join(self.plans)
-                raise ValueError(f"a reference in mode {', '.join(unknown) or 'none'}; `plans` has {known}")
+                modes = ", ".join(self.plans)
+                raise ValueError(f"a reference in mode {', '.join(unknown) or 'none'}; `plans` has {modes}")
         return self
 
     @model_validator(mode="after")
     def _nothing_twice(self) -> Self:
         angles = () if isinstance(self.omega_deg, AngleSteps) else self.omega_deg
-        for what, values in (
+        for kind, values in (
             ("wavelength", self.wavelengths_nm), ("angle", angles), ("sample", [s.name or s.kind for s in self.samples])
         ):  # fmt: skip
             for k, value in enumerate(values):
                 if value in values[:k]:
-                    raise ValueError(f"the {what} {value} is listed twice; each is taken once")
+                    raise ValueError(f"the {kind} {value} is listed twice; each is taken once")
         return self
 
     @classmethod
@@ -164,9 +164,9 @@ def captures(campaign: Campaign) -> Iterator[CampaignCapture]:
                     "exposure_s": _exposure(campaign, wavelength),
                     "continue_after_interlock": campaign.continue_after_interlock,
                 }
-                for taken, omega in enumerate(campaign.angles_deg()):
+                for index, omega in enumerate(campaign.angles_deg()):
                     for reference in campaign.references:
-                        due = taken == 0 or (reference.every is not None and taken % reference.every == 0)
+                        due = index == 0 or (reference.every is not None and index % reference.every == 0)
                         if due and mode in reference.modes:
                             number += 1
                             chosen = plan.with_changes(

@@ -72,19 +72,19 @@ def check_all(
     """Check every capture against the devices and the disc; nothing moves. Returns failures and passes alike."""
     planned = []
     pose: dict[str, float] = {}
-    here = rig.where_once_homed()
-    seen: dict[tuple[str, str], CheckResult] = {}
+    start_deg = rig.where_once_homed()
+    results: dict[tuple[str, str], CheckResult] = {}
     for capture, job in jobs:
-        table = unwound(folded(job.table, rig), rig, here)
-        for check in check_with_devices(replace(job, table=table), rig, folder, here):
-            seen.setdefault((check.what, check.found), check)
-        here |= states_deg(table)[-1]
+        table = unwound(folded(job.table, rig), rig, start_deg)
+        for check in check_with_devices(replace(job, table=table), rig, folder, start_deg):
+            results.setdefault((check.what, check.found), check)
+        start_deg |= states_deg(table)[-1]
         settings = rig.require_camera().settings
         size = bytes_needed(len(job.table), 1, (settings.height or 0, settings.width or 0))
         planned.append(Planned(capture, job, capture_seconds(job, rig, pose), size))
         pose = pose | last_pose_deg(job)
     samples = [job.plan.sample.name or job.plan.sample.kind for _, job in jobs]
-    checks = [*check_machine(rig.config, samples), *seen.values()]
+    checks = [*check_machine(rig.config, samples), *results.values()]
     missing = sum(p.size for p in planned if not (folder / p.capture.name).exists())
     return planned, [*checks, check_disc("disc for the campaign", folder, missing + BOOKS)]
 
@@ -148,13 +148,13 @@ class CampaignRun:
             self.folder.log("campaign stopped at once")
             raise
         except Exception as error:
-            known = as_known(error)
+            failure = as_known(error)
             if self._rig is not None:
-                self._rig.call_for_help(known)
-            self.folder.log("campaign failed", error=str(known), **_trace(known))
-            if known is error:
+                self._rig.call_for_help(failure)
+            self.folder.log("campaign failed", error=str(failure), **_trace(failure))
+            if failure is error:
                 raise
-            raise known from error
+            raise failure from error
         finally:
             self._close_rig()
 
@@ -293,17 +293,17 @@ def _seal(final: Path) -> bool:
 def _is_complete(path: Path, plan: MeasurementPlan, config: RigConfig, instrument: InstrumentModel) -> bool:
     if not path.exists():
         return False
-    with Capture(path) as there:
-        require_same(there, plan, config, instrument)
-        return there.status == "complete"
+    with Capture(path) as capture:
+        require_same(capture, plan, config, instrument)
+        return capture.status == "complete"
 
 
 def _states_in(final: Path) -> int:
     path = _begun(final)
     try:
         if path is not None:
-            with Capture(path) as there:
-                return len(there.done)
+            with Capture(path) as capture:
+                return len(capture.done)
     except CaptureError:
         pass
     return 0

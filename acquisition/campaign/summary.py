@@ -36,15 +36,15 @@ def summary_lines(folder: Path, names: Sequence[str], index: Mapping[str, Mappin
     if events:
         lines.append(f"first started {events[0]['time']}, last word {events[-1]['time']}")
     kinds = Counter(str(event.get("event")) for event in events)
-    told = [f"{kinds[kind]} x {kind}" for kind in ("capture failed", "waiting", "campaign stopped") if kinds[kind]]
-    if told:
-        lines.append(", ".join(told))
+    incidents = [f"{kinds[kind]} x {kind}" for kind in ("capture failed", "waiting", "campaign stopped") if kinds[kind]]
+    if incidents:
+        lines.append(", ".join(incidents))
     return lines
 
 
 def _others(counts: Counter[str]) -> str:
-    others = [f"{count} {word}" for word, count in sorted(counts.items()) if word != "complete"]
-    return f" ({', '.join(others)})" if others else ""
+    tallies = [f"{count} {word}" for word, count in sorted(counts.items()) if word != "complete"]
+    return f" ({', '.join(tallies)})" if tallies else ""
 
 
 def _named(word: str, names: Sequence[str], index: Mapping[str, Mapping[str, Any]]) -> list[str]:

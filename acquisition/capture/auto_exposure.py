@@ -32,8 +32,8 @@ def brightest_states(table: StateTable, instrument: InstrumentModel, sample: str
         return light[:1]
     angles = {axis: table.angles_deg[axis][light] for axis in instrument.axes}
     w = instrument.rows(angles, changes_at(instrument, angles)).max(axis=1)
-    known = {"air": [np.eye(4)], "mirror": [mueller.IDEAL_MIRROR]}
-    samples = known.get(sample, [mueller.IDEAL_DEPOLARIZER, np.eye(4), mueller.IDEAL_MIRROR])
+    ideal = {"air": [np.eye(4)], "mirror": [mueller.IDEAL_MIRROR]}
+    samples = ideal.get(sample, [mueller.IDEAL_DEPOLARIZER, np.eye(4), mueller.IDEAL_MIRROR])
     chosen: list[int] = []
     for matrix in samples:
         for k in np.argsort(-(w @ np.asarray(matrix).ravel()))[:PROBES_EACH]:

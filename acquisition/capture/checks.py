@@ -56,8 +56,8 @@ def standing_pose_deg(plan: MeasurementPlan, rig: RigConfig) -> dict[str, float]
         if isinstance(angle, dict):
             match = [v for k, v in angle.items() if abs(k - plan.wavelength_nm) < 0.5]
             if not match:
-                known = ", ".join(f"{k:g}" for k in angle)
-                raise PlanRefused([f"pose of {axis}: the rig file has {known} nm, not {plan.wavelength_nm:g} nm"])
+                listing = ", ".join(f"{k:g}" for k in angle)
+                raise PlanRefused([f"pose of {axis}: the rig file has {listing} nm, not {plan.wavelength_nm:g} nm"])
             pose[axis] = match[0]
         else:
             pose[axis] = angle
@@ -69,8 +69,8 @@ def standing_pose_deg(plan: MeasurementPlan, rig: RigConfig) -> dict[str, float]
 def check_plan(plan: MeasurementPlan, rig: RigConfig) -> list[CheckResult]:
     """What the files alone tell: mode, wavelength, axes, exposure, forbidden poses."""
     checks = [_member("mode", plan.mode, list(rig.modes))]
-    known = [f"{w:g}" for w in rig.wavelengths_nm]
-    checks.append(_member("wavelength_nm", f"{plan.wavelength_nm:g}", known))
+    wavelengths = [f"{w:g}" for w in rig.wavelengths_nm]
+    checks.append(_member("wavelength_nm", f"{plan.wavelength_nm:g}", wavelengths))
     if rig.simulator is not None:
         checks.append(_member("sample", plan.sample.name or plan.sample.kind, sorted(rig.simulator.samples)))
     try:
@@ -86,8 +86,8 @@ def check_plan(plan: MeasurementPlan, rig: RigConfig) -> list[CheckResult]:
     if plan.sample.kind == "air" and abs(plan.omega_deg - 180) > 0.5:
         checks.append(CheckResult("sample", False, f"air needs omega 180 (straight through), not {plan.omega_deg:g}"))
     if plan.darks and rig.source is None:
-        found = f"{plan.darks} dark states, but the rig has no source that shuts off the light. "
-        checks.append(CheckResult("darks", False, found + "Set darks to 0, or give the rig `source: {kind: manual}`"))
+        text = f"{plan.darks} dark states, but the rig has no source that shuts off the light. "
+        checks.append(CheckResult("darks", False, text + "Set darks to 0, or give the rig `source: {kind: manual}`"))
     low, high = rig.exposure_s
     if not isinstance(plan.exposure_s, AutoExposure):
         longest = plan.exposure_s * max(plan.bracket)
@@ -100,8 +100,8 @@ def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) 
     """Forbidden poses of every state and step, and whether the states determine a Mueller matrix."""
     for axis, column in table.angles_deg.items():
         if not np.all(np.abs(column) < NO_LIMIT_DEG):
-            found = f"{column[np.argmin(np.abs(column) < NO_LIMIT_DEG)]:g} deg; no controller counts so far"
-            return [CheckResult(f"angles of {axis}", False, found)]
+            text = f"{column[np.argmin(np.abs(column) < NO_LIMIT_DEG)]:g} deg; no controller counts so far"
+            return [CheckResult(f"angles of {axis}", False, text)]
         # The limits of the open controller decide whether a folded target is inside.
         ends, unit = rig.axes[axis].limits_deg, rig.axes[axis].unit
         if ends is None or axis in rig.fold_deg:
@@ -110,34 +110,34 @@ def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) 
         beyond = [target for target in column.tolist() if target not in limits]
         if beyond:
             allowed = f"the limits are {limits} {unit} (limits_deg of the rig file)"
-            found = f"{beyond[0]:g} {unit}; {allowed}. Change the plan"
-            return [CheckResult(f"limits of {axis}", False, found + _could_fold(axis, rig))]
+            text = f"{beyond[0]:g} {unit}; {allowed}. Change the plan"
+            return [CheckResult(f"limits of {axis}", False, text + _could_fold(axis, rig))]
     checks = _free_ways(rig, states_deg(table))
     lacking = [axis for axis in instrument.axes if axis not in table.angles_deg]
     if lacking:
-        found = f"instrument {instrument.name!r} turns with {', '.join(lacking)}, the plan does not"
-        return [*checks, CheckResult("instrument", False, found)]
+        text = f"instrument {instrument.name!r} turns with {', '.join(lacking)}, the plan does not"
+        return [*checks, CheckResult("instrument", False, text)]
     volts = [a for a, column in table.angles_deg.items() if rig.axes[a].unit == "V" and np.ptp(column) > 0]
     if ignored := sorted(set(volts) - set(instrument.axes)):
-        found = f"instrument {instrument.name!r} does not depend on the voltage of {', '.join(ignored)}, which changes"
-        return [*checks, CheckResult("instrument", False, f"{found}. Give its W in the instrument file (`measured`)")]
+        text = f"instrument {instrument.name!r} does not depend on the voltage of {', '.join(ignored)}, which changes"
+        return [*checks, CheckResult("instrument", False, f"{text}. Give its W in the instrument file (`measured`)")]
     if len(instrument.channels) > 1 and instrument.mosaic is None and instrument.beams is None:
-        found = f"{len(instrument.channels)} channels on one camera: the instrument file says by `beams` where they lie"
-        return [*checks, CheckResult("instrument", False, found)]
+        text = f"{len(instrument.channels)} channels on one camera: the instrument file says by `beams` where they lie"
+        return [*checks, CheckResult("instrument", False, text)]
     light = [k for k, role in enumerate(table.role) if role != "dark"]
     angles = {axis: table.angles_deg[axis][light] for axis in instrument.axes}
     # A mosaic before which nothing turns measures one linear Stokes vector.
     if angles and (instrument.mosaic is None or any(np.ptp(turned) > 0 for turned in angles.values())):
         w = instrument.rows(angles, changes_at(instrument, angles))
         basis = determined_basis(instrument)
-        r, wanted = rank(w), basis.shape[1]
+        r, full_rank = rank(w), basis.shape[1]
         size = np.linalg.svd(w.reshape(-1, 16) @ basis, compute_uv=False)
-        condition = size[0] / size[-1] if r == wanted else np.inf
-        found = f"rank {r} of {wanted}, condition number {condition:.2f}"
-        if r < wanted:
-            what = "a Mueller matrix" if wanted == 16 else "all that this instrument can"
-            found += f": these states do not determine {what}. Change states, step_deg or ratio"
-        checks.append(CheckResult("state table", r == wanted, found))
+        condition = size[0] / size[-1] if r == full_rank else np.inf
+        text = f"rank {r} of {full_rank}, condition number {condition:.2f}"
+        if r < full_rank:
+            quantity = "a Mueller matrix" if full_rank == 16 else "all that this instrument can"
+            text += f": these states do not determine {quantity}. Change states, step_deg or ratio"
+        checks.append(CheckResult("state table", r == full_rank, text))
     return checks
 
 
@@ -145,16 +145,16 @@ def _free_ways(rig: RigConfig, poses: Sequence[Mapping[str, float]]) -> list[Che
     """From each state to the next, and from each to where a run that is stopped parks."""
     before: Mapping[str, float] = poses[0]
     for k, pose in enumerate(poses):
-        found = find_obstacle(rig, before, pose)
-        if found is not None:
-            return [CheckResult("poses", False, f"state {k} meets {found}")]
+        obstacle = find_obstacle(rig, before, pose)
+        if obstacle is not None:
+            return [CheckResult("poses", False, f"state {k} meets {obstacle}")]
         before = pose
     solids = f", {len(rig.solids.parts)} solids" if rig.solids else ""
     checks = [CheckResult("poses", True, f"{len(poses)} states outside {len(rig.forbidden)} forbidden ranges{solids}")]
     for k, pose in enumerate(poses if rig.park_deg else ()):
-        found = find_obstacle(rig, pose, {**pose, **rig.park_deg}, rig.park_deg)
-        if found is not None:
-            return [*checks, CheckResult("way to the park pose", False, f"from state {k} it meets {found}")]
+        obstacle = find_obstacle(rig, pose, {**pose, **rig.park_deg}, rig.park_deg)
+        if obstacle is not None:
+            return [*checks, CheckResult("way to the park pose", False, f"from state {k} it meets {obstacle}")]
     return checks
 
 
@@ -201,8 +201,8 @@ def check_devices(
 def _check_first_move(table: StateTable, rig: Rig, state: int, here_deg: Mapping[str, float]) -> CheckResult:
     by = states_deg(turned(table, turns_to(table, rig, state, here_deg, wanted={})))
     if find_way(rig.config, here_deg, by[state], by, limits=rig.limits, first=ARM) is None:
-        found = find_obstacle(rig.config, here_deg, {**here_deg, **by[state]}, by[state], limits=rig.limits)
-        return CheckResult("first move", False, f"to state {state} it meets {found}, and there is no way round it")
+        obstacle = find_obstacle(rig.config, here_deg, {**here_deg, **by[state]}, by[state], limits=rig.limits)
+        return CheckResult("first move", False, f"to state {state} it meets {obstacle}, and there is no way round it")
     return CheckResult("first move", True, f"free to state {state}")
 
 
@@ -225,5 +225,5 @@ def _could_fold(axis: str, rig: RigConfig) -> str:
 
 
 def _member(what: str, value: str, known: list[str]) -> CheckResult:
-    there = value in known
-    return CheckResult(what, there, value if there else f"{value!r} is not one of {', '.join(known)}")
+    is_listed = value in known
+    return CheckResult(what, is_listed, value if is_listed else f"{value!r} is not one of {', '.join(known)}")

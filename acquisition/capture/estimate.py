@@ -17,8 +17,8 @@ def capture_seconds(job: Job, rig: Rig, before_deg: Mapping[str, float] | None =
     """
     table = folded(job.table, rig)
     first = {axis: float(column[0]) for axis, column in table.angles_deg.items()}
-    here = before_deg or {}
-    seconds = sum(_move_s(rig, axis, angle - here[axis]) for axis, angle in first.items() if axis in here)
+    start_deg = before_deg or {}
+    seconds = sum(_move_s(rig, axis, angle - start_deg[axis]) for axis, angle in first.items() if axis in start_deg)
     for k in range(len(table)):
         longest = 0.0
         for axis, column in table.angles_deg.items():

@@ -60,11 +60,11 @@ class FrameChecks:
         ------
         FrameLost
         """
-        asked = f"camera, frame of state {state}"
+        request = f"camera, frame of state {state}"
         again = self.evidence.repeats(frame.pixels)
         rig.last_frame = frame.pixels
         if again is not None:
-            raise FrameLost(asked, again, "Switch the camera off and on")
+            raise FrameLost(request, again, "Switch the camera off and on")
         applied = rig.require_camera().applied()
         # The exposure is that of the state; all else as at the first frame, not as another program left it meanwhile.
         self._began_with = self._began_with or settings
@@ -79,7 +79,7 @@ class FrameChecks:
         if changed:
             rig.forget_exposure()
             raise FrameLost(
-                asked, f"the camera has {', '.join(changed)}: something changed its settings", "End other programs"
+                request, f"the camera has {', '.join(changed)}: something changed its settings", "End other programs"
             )
 
     def report(
@@ -118,7 +118,7 @@ class FrameChecks:
             The darks hold light.
         """
         self._look_for_light(report, planned_s, pose)
-        found = self.evidence.look(
+        findings = self.evidence.look(
             report.state,
             frame.pixels,
             number=frame.frame_id,
@@ -126,7 +126,7 @@ class FrameChecks:
             exposure_s=report.exposure_s,
             light=report.role not in ("dark", "flat"),
         )
-        for finding in found:
+        for finding in findings:
             self._warn(f"false frame: {finding.text}")
 
     def _look_for_light(self, report: StateReport, planned_s: float, pose: tuple[float, ...]) -> None:

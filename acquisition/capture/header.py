@@ -63,8 +63,8 @@ def versions() -> dict[str, str]:
     import h5py
 
     names = ("umov", "numpy", "h5py", "pyserial", "pydantic")
-    found = {name: version(name) for name in names}
-    return found | {"hdf5": h5py.version.hdf5_version, "python": platform.python_version()}
+    by_package = {name: version(name) for name in names}
+    return by_package | {"hdf5": h5py.version.hdf5_version, "python": platform.python_version()}
 
 
 def default_name(plan: MeasurementPlan) -> str:

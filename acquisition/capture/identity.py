@@ -49,12 +49,12 @@ def identity_of(plan: MeasurementPlan, config: RigConfig, instrument: Instrument
 
 def lasting(devices: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, str]]:
     """The properties of devices that stay, as text."""
-    return {name: {key: str(told[key]) for key in LASTING if key in told} for name, told in devices.items()}
+    return {name: {key: str(entry[key]) for key in LASTING if key in entry} for name, entry in devices.items()}
 
 
 def places(devices: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
     """Port or address of each device."""
-    return {name: str(told.get("port", told.get("address", ""))) for name, told in devices.items()}
+    return {name: str(entry.get("port", entry.get("address", ""))) for name, entry in devices.items()}
 
 
 def plain(model: BaseModel) -> Any:
@@ -77,13 +77,13 @@ def files_of(config: RigConfig, mode: str) -> dict[str, str]:
     tree = config.model_dump(mode="python", exclude_none=True)
     tree.pop("modes")
     tree.pop("wire_log", None)
-    found: dict[str, str] = {}
+    digests: dict[str, str] = {}
     for key, path in _paths(tree, ""):
         named = ((f"{key}.{name}", file) for name, file in named_files(path))
         for name, file in ((key, path), *named):
             if os.path.isfile(file):
-                found[name] = hashlib.sha256(file.read_bytes()).hexdigest()
-    return found
+                digests[name] = hashlib.sha256(file.read_bytes()).hexdigest()
+    return digests
 
 
 def _optics(instrument: InstrumentModel) -> Any:
@@ -111,16 +111,16 @@ def require_same(capture: Capture, plan: MeasurementPlan, config: RigConfig, ins
     then_rig = parse_yaml(header.rig_yaml, RigConfig, source=f"{capture.path}: rig")
     then_plan = parse_yaml(header.plan_yaml, MeasurementPlan, source=f"{capture.path}: plan")
     then_model = parse_yaml(header.instrument_yaml, InstrumentModel, source=f"{capture.path}: instrument model")
-    found = [*differences(plain(then_plan), plain(plan), "plan")]
-    if not found:
+    changes = [*differences(plain(then_plan), plain(plan), "plan")]
+    if not changes:
         now = identity_of(plan, config, instrument, None)
-        found += differences(began.simulated, now.simulated, "simulated")
-        found += differences(rig_content(then_rig, mode), rig_content(config, mode), "rig")
-        found += differences(_optics(then_model), _optics(instrument), "instrument")
-        found += differences(began.files, now.files, "content of the file")
-        found += differences(began.software, now.software, "program")
-    if found:
-        raise Differs(str(capture.path), found)
+        changes += differences(began.simulated, now.simulated, "simulated")
+        changes += differences(rig_content(then_rig, mode), rig_content(config, mode), "rig")
+        changes += differences(_optics(then_model), _optics(instrument), "instrument")
+        changes += differences(began.files, now.files, "content of the file")
+        changes += differences(began.software, now.software, "program")
+    if changes:
+        raise Differs(str(capture.path), changes)
 
 
 def devices_of(rig: Rig) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -132,12 +132,12 @@ def require_same_devices(capture: Capture, devices: dict[str, Any], settings: di
     """Refuse to go on with other devices, or a camera that is set otherwise (`devices_of`). Raises Differs."""
     began = capture.segments[0]
     then = began.identity.devices if began.identity is not None else {}
-    found = [*differences(then, devices, "device")]
+    changes = [*differences(then, devices, "device")]
     for key in CameraSettings.model_fields:
         if key not in PASSING:
-            found += differences(began.camera_settings.get(key), settings.get(key), f"camera setting.{key}")
-    if found:
-        raise Differs(str(capture.path), found)
+            changes += differences(began.camera_settings.get(key), settings.get(key), f"camera setting.{key}")
+    if changes:
+        raise Differs(str(capture.path), changes)
 
 
 def differences(then: Any, now: Any, key: str) -> Iterator[str]:

@@ -172,12 +172,12 @@ def job_of(path: Path, rig: RigConfig | None = None, plan: MeasurementPlan | Non
     table = replace(job.table, angles_deg=targets)
     refuse_failed(check_table(table, job.rig, job.instrument))
     job = replace(job, first=next((state for state in range(len(table)) if state not in done), 0))
-    known = np.isfinite(exposure_s)
-    if not known.any():
+    is_finite = np.isfinite(exposure_s)
+    if not is_finite.any():
         return replace(job, table=table)
     # The exposure of a state whose record was damaged: as the plan has it to that of the others.
-    factor = float(np.median(exposure_s[known] / table.exposure_s[known]))
-    exposure_s = np.where(known, exposure_s, factor * table.exposure_s)
+    factor = float(np.median(exposure_s[is_finite] / table.exposure_s[is_finite]))
+    exposure_s = np.where(is_finite, exposure_s, factor * table.exposure_s)
     return replace(job, table=replace(table, exposure_s=exposure_s), exposure_known=True)
 
 

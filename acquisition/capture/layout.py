@@ -69,13 +69,13 @@ def put_layout(path: Path, needed: int, make: Callable[[h5py.File], None], begin
 
 def _mark_places(memory: int) -> None:
     """Write the place of the status into the file, and the status itself."""
-    found: dict[bytes, int] = {}
+    offsets: dict[bytes, int] = {}
     for start, piece in _pieces(memory, overlap=len(STATUS_MARK)):
         for mark in (STATUS_MARK, PLACE_MARK):
-            if (at := piece.find(mark)) >= 0:
-                found[mark] = start + at
-    os.pwrite(memory, np.int64(found[STATUS_MARK]).tobytes(), found[PLACE_MARK])
-    os.pwrite(memory, RUNNING, found[STATUS_MARK])
+            if (index := piece.find(mark)) >= 0:
+                offsets[mark] = start + index
+    os.pwrite(memory, np.int64(offsets[STATUS_MARK]).tobytes(), offsets[PLACE_MARK])
+    os.pwrite(memory, RUNNING, offsets[STATUS_MARK])
 
 
 def _pieces(memory: int, overlap: int = 0) -> list[tuple[int, bytes]]:

@@ -25,9 +25,9 @@ def check_machine(rig: RigConfig, samples: Iterable[str]) -> list[CheckResult]:
     commands = {"alert": rig.alert, "notify": rig.notify.command if rig.notify else ()}
     for key, command in commands.items():
         if command:
-            found = shutil.which(command[0])
+            program = shutil.which(command[0])
             lacking = f"there is no program {command[0]!r} here: nobody would be called"
-            checks.append(CheckResult(key, found is not None, found or lacking))
+            checks.append(CheckResult(key, program is not None, program or lacking))
     if rig.simulator is not None:
         for name in dict.fromkeys(samples):
             if name in rig.simulator.samples:

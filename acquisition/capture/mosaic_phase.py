@@ -93,9 +93,9 @@ def _named_otherwise(mosaic: tuple[tuple[str, ...], ...], who: CameraIdentity) -
     # Such a format begins with a whole super-pixel wherever its region is.
     if who.analyzers is None or mosaic == who.analyzers:
         return None
-    told, declared = (" / ".join(" ".join(line) for line in layout) for layout in (who.analyzers, mosaic))
+    actual, declared = (" / ".join(" ".join(line) for line in layout) for layout in (who.analyzers, mosaic))
     return (
-        f"pixel format {who.pixel_format} identifies the analyzer of each count, which makes super-pixels of {told}; "
+        f"pixel format {who.pixel_format} identifies the analyzer of each count, which makes super-pixels of {actual}; "
         f"the instrument file has {declared}. Write `mosaic: {[list(line) for line in who.analyzers]}` there and name "
         "the channels as the camera does, each with the azimuth that it has on your bench; or choose a raw format"
     )

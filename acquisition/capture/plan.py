@@ -90,10 +90,10 @@ class ListedStates(FiniteSection):
         """Target angles of each axis (states,), degrees or volts. Raises ConfigError for a name that is not there."""
 
         def number(axis: str, target: float | str) -> float:
-            known = named.get(axis, {})
-            if isinstance(target, str) and target not in known:
-                raise ConfigError(f"axis {axis} has no state {target!r}, only: {', '.join(known) or 'none'}")
-            return known[target] if isinstance(target, str) else target
+            states = named.get(axis, {})
+            if isinstance(target, str) and target not in states:
+                raise ConfigError(f"axis {axis} has no state {target!r}, only: {', '.join(states) or 'none'}")
+            return states[target] if isinstance(target, str) else target
 
         return {axis: np.array([number(axis, target) for target in column]) for axis, column in self.angles.items()}
 

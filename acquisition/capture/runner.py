@@ -348,10 +348,10 @@ class CaptureRunner:
 
     def _clock_jumped(self) -> bool:
         """Tell of a clock that was set or a machine that slept since the last look."""
-        what = self._wall_clock.look()
-        if what is None:
+        jump = self._wall_clock.look()
+        if jump is None:
             return False
-        self.warn(f"{what}; times in the capture continue evenly")
+        self.warn(f"{jump}; times in the capture continue evenly")
         self.rig.require_camera().forget_clock()
         return True
 

@@ -176,8 +176,8 @@ def _run(
         _announce(job, rig, runner, len(pending))
         with stop.failing_here():
             _go_to_start(job, rig, runner, first)
-            whole = _take_states(job, runner, pending)
-        if whole:
+            is_whole = _take_states(job, runner, pending)
+        if is_whole:
             status = "complete"
         else:
             status = "aborted"
@@ -197,9 +197,9 @@ def _run(
     if judged is not None:
         runner.warn(f"the frames could not be compared: {judged}")
     closing, path = _end_segment(runner, rig, status, failure)
-    told = run_all([("tell of the end", partial(observer.run_ended, status, closing)) for observer in watchers])
-    if told is not None and failure is None:
-        raise as_known(told)
+    fault = run_all([("tell of the end", partial(observer.run_ended, status, closing)) for observer in watchers])
+    if fault is not None and failure is None:
+        raise as_known(fault)
     if failure is not None:
         failure.add_note(f"States done so far are in {path}. Continue with: acquire --resume {path}")
         raise failure
@@ -302,13 +302,13 @@ def _end_segment(
         return closing, writer.seal(status, closing, keep_partial=failure is not None)
     except (AcquisitionError, OSError) as error:
         writer.abandon()
-        kept = keep_end(writer.path, closing)
+        note = keep_end(writer.path, closing)
         if failure is None:
-            error.add_note(kept)
+            error.add_note(note)
             raise
         if str(error) != str(failure):
             failure.add_note(f"the end of the run could not be recorded: {error}")
-        failure.add_note(kept)
+        failure.add_note(note)
         return closing, writer.path
 
 

@@ -65,9 +65,9 @@ class TimeLedger:
         (`of_it_readout`) as avoidable too.
         """
         total = self.total_s()
-        known = sum(self.spent_s.values())
+        spent_s = sum(self.spent_s.values())
         summary = {f"{name}_s": round(value, 4) for name, value in sorted(self.spent_s.items())}
-        summary |= {"overhead_s": round(total - known, 4), "total_s": round(total, 4), "states": float(self.states)}
+        summary |= {"overhead_s": round(total - spent_s, 4), "total_s": round(total, 4), "states": float(self.states)}
         if self.unavoidable_s > 0:
             summary["unavoidable_s"] = round(self.unavoidable_s, 4)
             summary["of_it_readout_s"] = round(self.readout_s, 4)

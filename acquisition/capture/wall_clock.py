@@ -26,10 +26,10 @@ def read_clocks() -> Clocks:
     """Read all of them as nearly at once as the machine allows."""
     for _ in range(20):
         start_s = time.clock_gettime(time.CLOCK_MONOTONIC)
-        found = Clocks(time.time(), time.clock_gettime(time.CLOCK_BOOTTIME), time.clock_gettime(time.CLOCK_MONOTONIC))
-        if found.awake_s - start_s < READING_S:
+        clocks = Clocks(time.time(), time.clock_gettime(time.CLOCK_BOOTTIME), time.clock_gettime(time.CLOCK_MONOTONIC))
+        if clocks.awake_s - start_s < READING_S:
             break
-    return found
+    return clocks
 
 
 class WallClock:

@@ -407,11 +407,11 @@ def _require_layout(path: Path, table: StateTable) -> None:
     """
     try:
         with Capture(path) as capture:
-            found = capture.planned_targets_deg() | {"exposure_s": capture.planned_column("exposure_s")}
+            columns = capture.planned_targets_deg() | {"exposure_s": capture.planned_column("exposure_s")}
     except CaptureError as error:
         raise OSError(f"the new file does not read back: {error}") from error
     for name, values in {**table.angles_deg, "exposure_s": table.exposure_s}.items():
-        if not np.array_equal(found.get(name, ()), values):
+        if not np.array_equal(columns.get(name, ()), values):
             raise OSError(f"the new file does not read back: {name} is not as it was written")
 
 

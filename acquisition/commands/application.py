@@ -111,12 +111,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt as error:
         _report(error, INTERRUPTED, "stopped at once; every axis was sent a stop")
     except Exception as error:  # noqa: BLE001 - the last boundary: a user reads a line, the traceback goes to a file
-        known = as_known(error)
-        if isinstance(known, Unforeseen):
+        failure = as_known(error)
+        if isinstance(failure, Unforeseen):
             from acquisition.rig import alarms
 
-            known.add_note(alarms.keep("traceback", f"traceback-{os.getpid()}.txt", known.trace))
-        _report(known, 1)
+            failure.add_note(alarms.keep("traceback", f"traceback-{os.getpid()}.txt", failure.trace))
+        _report(failure, 1)
 
 
 def _say_alarms() -> None:

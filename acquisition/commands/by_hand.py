@@ -47,13 +47,13 @@ def doctor(
     from processing.commands.command_line import shown
 
     config = _load(rig)
-    there = []
+    findings = []
     with StopRequest(patience=1), Console(stderr=True).status("looking at the rig") as status:
         for finding in examine(config, out, frames):
-            there.append(finding)
+            findings.append(finding)
             status.update(f"looking at the rig: {escape(shown(finding.what))} done")
-    print_rows(finding.row for finding in there)
-    if wrong := [finding.what for finding in there if finding.well is False]:
+    print_rows(finding.row for finding in findings)
+    if wrong := [finding.what for finding in findings if finding.well is False]:
         typer.echo(f"not as it should be: {', '.join(wrong)}", err=True)
         raise typer.Exit(1)
 
@@ -162,11 +162,11 @@ def acknowledge() -> None:
     """End the alarms that the guard repeats, once somebody has looked at the rig."""
     from acquisition.rig import alarms
 
-    given = alarms.unacknowledged()
-    for alarm in given:
+    pending = alarms.unacknowledged()
+    for alarm in pending:
         typer.echo(f"{alarm.time}, rig {alarm.rig}: {alarm.text}")
         alarms.acknowledge(alarm)
-    typer.echo(f"{len(given)} acknowledged" if given else "there is no alarm")
+    typer.echo(f"{len(pending)} acknowledged" if pending else "there is no alarm")
 
 
 def _load(rig: Path | None) -> RigConfig:

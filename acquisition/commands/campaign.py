@@ -66,13 +66,13 @@ def _run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Ob
     note_campaign(folder, file, rig_file)
     try:
         operator = Operator(partial(say, console), stop, options.yes, rig_config.simulated)
-        told = RunFile(folder, rig_config.simulated)
+        run_file = RunFile(folder, rig_config.simulated)
         with (
             notifying(rig_config.notify, folder, rig_config.simulated) as notifier,
             live_page(options.live, rig_config, stop, console) as page,
-            told,
+            run_file,
         ):
-            watchers = [ConsoleProgress(console), told, notifier, *page, *observers]
+            watchers = [ConsoleProgress(console), run_file, notifier, *page, *observers]
             try:
                 done = CampaignRun(
                     campaign, rig_config, held, operator, stop=stop, observers=watchers, home=options.home
@@ -109,10 +109,10 @@ def _rig_of(campaign: Campaign, file: Path) -> Path | None:
 
 def _refuse_with_campaign(options: Options, file: Path) -> None:
     """A campaign has its captures in its file: an option that changed none of them would only seem to be heard."""
-    given = options.given("omega", "mode", "wavelength", "sample", "exposure", "plan", "resume")
-    if given:
+    flags = options.given("omega", "mode", "wavelength", "sample", "exposure", "plan", "resume")
+    if flags:
         raise ConfigError(
-            f"--{given[0]} has no meaning with --campaign: what is taken is in {file}, and what is missing of it is "
+            f"--{flags[0]} has no meaning with --campaign: what is taken is in {file}, and what is missing of it is "
             "gone on with. Leave one of the two out."
         )
 
@@ -139,8 +139,8 @@ def _grouped(checks: Sequence[CheckResult]) -> tuple[CheckResult, ...]:
         if check.passed:
             passed.setdefault(check.what, []).append(check.found)
     lines = [
-        CheckResult(what, True, found[0] if len(found) == 1 else f"{found[0]} ... {found[-1]} ({len(found)} different)")
-        for what, found in passed.items()
+        CheckResult(name, True, texts[0] if len(texts) == 1 else f"{texts[0]} ... {texts[-1]} ({len(texts)} different)")
+        for name, texts in passed.items()
     ]
     return (*(check for check in checks if not check.passed), *lines)
 
@@ -149,7 +149,7 @@ def _show(planned: Sequence[Planned], checks: Sequence[CheckResult], folder: Pat
     console = Console(soft_wrap=True)
     rows = [("", "capture", "states", "s", "MB", "")]
     for entry in planned:
-        there = (folder / entry.capture.name).exists()
+        exists = (folder / entry.capture.name).exists()
         rows.append(
             (
                 str(entry.capture.number),
@@ -157,7 +157,7 @@ def _show(planned: Sequence[Planned], checks: Sequence[CheckResult], folder: Pat
                 str(len(entry.job.table)),
                 f"{entry.seconds:.0f}",
                 f"{entry.size / 1e6:.0f}",
-                "there already" if there else "reference" if entry.capture.reference else "",
+                "there already" if exists else "reference" if entry.capture.reference else "",
             )
         )
     print_rows(rows, console)

@@ -70,13 +70,13 @@ def _index(folder: Path) -> Iterator[Finding]:
     wrong = []
     for capture in planned:
         path = folder / capture.name
-        told = index.get(capture.name, {})
+        entry = index.get(capture.name, {})
         try:
-            wrong += [capture.name] if path.exists() and entry_of(capture, path) != told else []
+            wrong += [capture.name] if path.exists() and entry_of(capture, path) != entry else []
         except CaptureError:
             # Named above.
             continue
-        if told.get("status") == "complete" and not path.exists():
+        if entry.get("status") == "complete" and not path.exists():
             yield Finding(capture.name, False, f"{INDEX} has it as complete, but the file is not there")
     for path in sorted(folder.glob("*.h5*")):
         if path.name.removesuffix(NEW).removesuffix(PARTIAL) not in names and (
@@ -123,8 +123,8 @@ def compressed(folder: Path) -> Iterator[Finding]:
         except CaptureError as error:
             yield Finding(path.name, None, str(error))
             continue
-        found = "compressed already" if sizes is None else f"{sizes[0] / 1e6:.1f} MB, now {sizes[1] / 1e6:.1f} MB"
-        yield Finding(path.name, True, found)
+        detail = "compressed already" if sizes is None else f"{sizes[0] / 1e6:.1f} MB, now {sizes[1] / 1e6:.1f} MB"
+        yield Finding(path.name, True, detail)
 
 
 def _mended(path: Path) -> Finding:

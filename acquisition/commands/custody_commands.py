@@ -49,9 +49,9 @@ def _show(folder: Path, findings: Iterable[Finding]) -> None:
     from acquisition.screen.rows import print_rows
     from processing.errors import ProcessError
 
-    there = list(findings)
-    if not there:
+    results = list(findings)
+    if not results:
         raise ProcessError(f"{folder}: there is no capture in this folder. Name the one that holds the .h5 files.")
-    print_rows(finding.row for finding in there)
-    if any(finding.well is False for finding in there):
+    print_rows(finding.row for finding in results)
+    if any(finding.well is False for finding in results):
         raise typer.Exit(1)

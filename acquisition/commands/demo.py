@@ -61,8 +61,8 @@ def demo(
     console.print()
     show(result.judged.diagnosis, written=True)
     console.print("\nThe truth is opened", style="bold")
-    for true, found in cause_rows(result):
-        console.print(f"  built in  {true}\n  found     {found}", markup=False)
+    for fault, effect in cause_rows(result):
+        console.print(f"  built in  {fault}\n  found     {effect}", markup=False)
     console.print(f"\n{'':<26}{'before':>18}{'after':>18}{'photon noise':>15}", style="bold")
     for name, before, after, noise in figure_rows(result):
         console.print(f"  {name:<24}{before:>18}{after:>18}{noise:>15}", markup=False)

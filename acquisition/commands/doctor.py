@@ -80,8 +80,8 @@ def _guarded(what: str, look: Callable[[], str]) -> Finding:
 def _origin(name: str) -> str:
     """Where a package is imported from; it must be this environment, not the system that gi is borrowed from."""
     folder = Path(str(importlib.import_module(name).__file__)).parent
-    own = {Path(sysconfig.get_path(part)) for part in ("purelib", "platlib")}
-    if not any(folder.is_relative_to(place) for place in own):
+    folders = {Path(sysconfig.get_path(part)) for part in ("purelib", "platlib")}
+    if not any(folder.is_relative_to(place) for place in folders):
         raise AcquisitionError(
             f"it comes from {folder}, not from this environment. Unset PYTHONPATH; run ./lab, which shows only gi to it"
         )
@@ -156,7 +156,7 @@ def _camera(camera: Camera, config: RigConfig, frames: int) -> str:
     statistics = camera.statistics()
     temperature = camera.temperature_c()
     warm = "" if temperature is None else f", {temperature:.1f} C"
-    found = (
+    report = (
         f"{who.library}: {who.vendor} {who.model}, serial {who.serial_number}, "
         f"{who.sensor_width} x {who.sensor_height} {who.pixel_format} ({who.bits} bits), "
         f"{_packets(who)}{warm}; "
@@ -165,12 +165,12 @@ def _camera(camera: Camera, config: RigConfig, frames: int) -> str:
         + "".join(f"; NOT IN A KNOWN STATE: {text}" for text in camera.warnings())
     )
     if lost:
-        raise AcquisitionError(found + ". " + _against_loss(who))
+        raise AcquisitionError(report + ". " + _against_loss(who))
     if config.detector.bits is not None and camera.bits != config.detector.bits:
         raise AcquisitionError(
-            f"{found}. The rig file says {config.detector.bits} bits under `detector`; correct that or `camera`"
+            f"{report}. The rig file says {config.detector.bits} bits under `detector`; correct that or `camera`"
         )
-    return found
+    return report
 
 
 def _against_loss(who: CameraIdentity) -> str:

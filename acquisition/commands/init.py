@@ -158,9 +158,9 @@ def _axis(port: FoundPort) -> list[str]:
     kind = port.kind or "KIND"
     config: Any = device_kinds("axes")[port.kind].Config if port.kind else None
     more = [name for name, field in config.model_fields.items() if field.is_required()] if config else []
-    others = "".join(f", {name}: ..." for name in more if name != "port")
+    keys = "".join(f", {name}: ..." for name in more if name != "port")
     guess = f"probably {port.kind}" if port.kind else "which controller?"
-    return [f"#  {port.description}: {guess}", f"#  NAME: {{kind: {kind}, port: {port.path}{others}}}"]
+    return [f"#  {port.description}: {guess}", f"#  NAME: {{kind: {kind}, port: {port.path}{keys}}}"]
 
 
 def _camera(cameras: Sequence[dict[str, str]], why_none: str) -> list[str]:
@@ -171,9 +171,9 @@ def _camera(cameras: Sequence[dict[str, str]], why_none: str) -> list[str]:
         ]
     lines = ["# Cameras that answered; the first is taken. On gigabit links packet_size 9000 needs jumbo frames."]
     for number, camera in enumerate(cameras):
-        told = " ".join(filter(None, (camera["vendor"], camera["model"], "at", camera["address"])))
+        summary = " ".join(filter(None, (camera["vendor"], camera["model"], "at", camera["address"])))
         entry = f"camera: {{kind: aravis, device: {camera['serial_number']!r}, bits: 12}}"
-        lines += [f"# {told}", entry if number == 0 else f"# {entry}"]
+        lines += [f"# {summary}", entry if number == 0 else f"# {entry}"]
     return lines
 
 

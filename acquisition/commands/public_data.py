@@ -23,12 +23,12 @@ def list_command() -> None:
     """Every set: its name, title, licence, source and citation."""
     from processing.public_data.sets import catalogue
 
-    for name, known in catalogue().items():
-        typer.echo(f"{name}\n  {known.title}")
-        typer.echo(f"  licence {known.licence}; {known.source} at {known.commit[:12]}")
-        typer.echo(f"  {known.citation}{f' doi:{known.doi}' if known.doi else ''}")
-        if known.in_repository:
-            typer.echo(f"  in the repository (tests/data/{name}): {known.in_repository}")
+    for name, entry in catalogue().items():
+        typer.echo(f"{name}\n  {entry.title}")
+        typer.echo(f"  licence {entry.licence}; {entry.source} at {entry.commit[:12]}")
+        typer.echo(f"  {entry.citation}{f' doi:{entry.doi}' if entry.doi else ''}")
+        if entry.in_repository:
+            typer.echo(f"  in the repository (tests/data/{name}): {entry.in_repository}")
 
 
 @app.command("get")
@@ -48,17 +48,17 @@ def get_command(
     folder = out or Path("data") / name
     with progress_bar(f"getting {name}", "files") as tick:
         files = get_files(name, folder, tick)
-    known = catalogue()[name]
+    entry = catalogue()[name]
     typer.echo(f"{name}: {len(files)} files, each with the SHA-256 of the catalogue")
-    typer.echo(f"  licence: {known.licence}\n  cite: {known.citation}{f' doi:{known.doi}' if known.doi else ''}")
-    if known.note:
-        typer.echo(f"  {known.note}")
+    typer.echo(f"  licence: {entry.licence}\n  cite: {entry.citation}{f' doi:{entry.doi}' if entry.doi else ''}")
+    if entry.note:
+        typer.echo(f"  {entry.note}")
     tables = {folder / f"{table.name}.h5": table for table in tables_of(name, files)}
     if not tables:
         typer.echo("\n".join(map(str, files.values())))
         return
     folder.mkdir(parents=True, exist_ok=True)
-    instrument = CONFIGS / "instruments" / known.instrument
+    instrument = CONFIGS / "instruments" / entry.instrument
 
     def make(capture: Path, progress: object) -> Made:
         table = tables[capture]

@@ -99,16 +99,16 @@ def _run(options: Options, stop: StopRequest) -> int:
         if stop.requested:
             return INTERRUPTED
         take = session.resume if resuming else session.take
-        told = RunFile(path.parent, job.rig.simulated)
+        run_file = RunFile(path.parent, job.rig.simulated)
         on_disc(f"make {path.parent}", make_folder, path.parent)
         rig.start_guard(path.parent / GUARD_LOG)
         with (
             nullcontext(path) if resuming else free_name(path) as path,
             notifying(job.rig.notify, path, job.rig.simulated) as notifier,
             live_page(options.live, job.rig, stop, console) as page,
-            told,
+            run_file,
         ):
-            observers = [ConsoleProgress(console), told, notifier, *page]
+            observers = [ConsoleProgress(console), run_file, notifier, *page]
             result = take(job, rig, path, stop, observers=observers, home=options.home)
             notifier.tell("end", f"{path.name}: {result.states_done} of {result.states} states, {result.status}")
     summarize(job, result)
@@ -174,10 +174,10 @@ def _sealed(path: Path) -> Path | None:
 
 def _refuse_with_resume(options: Options) -> None:
     """A capture that is gone on with has its plan in its file."""
-    given = options.given("omega", "mode", "wavelength", "sample", "exposure", "plan", "seed")
-    if given:
+    flags = options.given("omega", "mode", "wavelength", "sample", "exposure", "plan", "seed")
+    if flags:
         raise ConfigError(
-            f"--{given[0]} has no meaning with --resume: the plan is in {options.resume}. Leave it out, or take a new "
+            f"--{flags[0]} has no meaning with --resume: the plan is in {options.resume}. Leave it out, or take a new "
             "capture without --resume."
         )
 
@@ -186,8 +186,8 @@ def plan_of(options: Options) -> MeasurementPlan:
     """The plan file, or the default plan of the mode, with the options on top."""
     path = options.plan or CONFIGS / "plans" / f"{options.mode or 'drr'}.yaml"
     if options.plan is None and not path.exists():
-        known = ", ".join(sorted(p.stem for p in (CONFIGS / "plans").glob("*.yaml")))
-        raise ConfigError(f"--mode {options.mode}: there is no default plan of that name, only {known}. Give --plan.")
+        modes = ", ".join(sorted(p.stem for p in (CONFIGS / "plans").glob("*.yaml")))
+        raise ConfigError(f"--mode {options.mode}: there is no default plan of that name, only {modes}. Give --plan.")
     plan = MeasurementPlan.load(path)
     sample = None if options.sample is None else sample_of(options.sample)
     return plan.with_changes(
@@ -254,9 +254,9 @@ def summarize(job: Job, result: Result) -> None:
         figure = f"not drawn ({getattr(error, 'strerror', None) or error}); the capture is whole"
     plan, ledger = job.plan, result.ledger
     darks = sum(role == "dark" for role in job.table.role)
-    what = f"{plan.mode}, {plan.wavelength_nm:g} nm, Omega {plan.omega_deg:g} deg, {plan.sample.name}"
+    title = f"{plan.mode}, {plan.wavelength_nm:g} nm, Omega {plan.omega_deg:g} deg, {plan.sample.name}"
     lines = [
-        ("what", ("SIMULATED " if job.rig.simulated else "") + what),
+        ("what", ("SIMULATED " if job.rig.simulated else "") + title),
         ("states", f"{result.states_done} of {result.states} ({darks} dark), {result.status}"),
         ("angles", f"read back at every state, at most {result.worst_angle_deg:.4f} deg from the target"),
         ("saturation", f"worst state {100 * result.saturated_fraction:.3f} % of pixels"),

@@ -53,12 +53,12 @@ def _maps(part: SubFigure, demo: Demo) -> None:
     end = float(np.nanpercentile(np.abs(mosaics[0]), END_PERCENT))
     axes = part.subplots(1, 2)
     shown: Any = None
-    for axis, mosaic, error, what, colour in zip(
+    for axis, mosaic, error, stage, colour in zip(
         axes, mosaics, (demo.before, demo.after), ("before", "after"), (BEFORE, AFTER), strict=True
     ):
         shown = axis.imshow(mosaic, cmap=SIGNED, vmin=-end, vmax=end, interpolation="nearest")
         axis.set_title(
-            f"Mueller matrix {what} the correction: rms error {error.mueller_rms:.4f}", fontsize=10, color=colour
+            f"Mueller matrix {stage} the correction: rms error {error.mueller_rms:.4f}", fontsize=10, color=colour
         )
         height, width = (n / 4 for n in mosaic.shape)
         for row, column in np.ndindex(4, 4):
@@ -73,8 +73,8 @@ def _maps(part: SubFigure, demo: Demo) -> None:
 
 def _mosaic(error: NDArray[np.float64]) -> NDArray[np.float64]:
     """(4, 4, rows, columns) as one image, cropped to the object, with a gap around each element."""
-    known = np.isfinite(error[0, 1])
-    rows, columns = (np.flatnonzero(known.any(axis=a)) for a in (1, 0))
+    valid = np.isfinite(error[0, 1])
+    rows, columns = (np.flatnonzero(valid.any(axis=a)) for a in (1, 0))
     cut = error[..., rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     padded = np.pad(cut, ((0, 0), (0, 0), (1, 1), (1, 1)), constant_values=np.nan)
     return np.concatenate([np.concatenate(list(line), axis=1) for line in padded], axis=0)
@@ -112,8 +112,8 @@ def _causes(part: SubFigure, demo: Demo) -> None:
     axis = part.subplots()
     axis.set_axis_off()
     lines: list[tuple[tuple[str, ...], str]] = []
-    for true, found in cause_rows(demo):
-        lines += [(("built in", true), "black"), (("found", found), AFTER), ((), "")]
+    for fault, effect in cause_rows(demo):
+        lines += [(("built in", fault), "black"), (("found", effect), AFTER), ((), "")]
     lines.append((("", "before", "after", "photon noise"), "0.4"))
     lines += [(row, "black") for row in figure_rows(demo)]
     step = min(0.085, 1.0 / len(lines))

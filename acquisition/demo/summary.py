@@ -12,11 +12,11 @@ def cause_rows(demo: Demo) -> list[tuple[str, str]]:
     """Each built-in fault with the effect found for it, then the effects found for none of them."""
     rows, matched = [], list[FoundEffect]()
     for fault in demo.faults:
-        found = demo.found_for(fault)
-        matched += found
-        rows.append((f"{fault.kind}: {fault.size}", told(found[0]) if found else NOT_FOUND))
-    others = [e for e in demo.judged.diagnosis.effects if not any(e is m for m in matched)]
-    return rows + [("nothing", told(e)) for e in others]
+        effects = demo.found_for(fault)
+        matched += effects
+        rows.append((f"{fault.kind}: {fault.size}", told(effects[0]) if effects else NOT_FOUND))
+    unmatched = [e for e in demo.judged.diagnosis.effects if not any(e is m for m in matched)]
+    return rows + [("nothing", told(e)) for e in unmatched]
 
 
 def told(effect: FoundEffect) -> str:

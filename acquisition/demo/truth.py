@@ -56,8 +56,8 @@ def draw_faults(seed: int, count: int, only: Sequence[str], states: int) -> tupl
     random = np.random.default_rng(seed)
     chosen: list[str] = []
     while len(chosen) < count:
-        taken = set(chosen) | (EXCLUSIVE if EXCLUSIVE & set(chosen) else set())
-        free = [k for k in kinds if k not in taken and (k in only if only else not FAULTS[k].slow)]
+        excluded = set(chosen) | (EXCLUSIVE if EXCLUSIVE & set(chosen) else set())
+        free = [k for k in kinds if k not in excluded and (k in only if only else not FAULTS[k].slow)]
         if not free:
             raise ConfigError(f"--faults {count}: only {len(chosen)} different faults can act together.")
         chosen.append(str(random.choice(free)))
@@ -96,7 +96,7 @@ def true_error(mueller: Path, xi0: Path, scene: Scene) -> TrueError:
     image = MuellerImage.load(mueller)
     with Product(xi0) as product:
         header = product.header
-        found, found_error = product.get("xi0"), product.get("xi0_errors")
+        estimate, sigma = product.get("xi0"), product.get("xi0_errors")
     rows, columns = image.mask.shape
     place = (float(header.omega_deg or 0), header.wavelength_nm, rows, columns)
     truth = scene.truth(*place)
@@ -106,12 +106,12 @@ def true_error(mueller: Path, xi0: Path, scene: Scene) -> TrueError:
         m, t = (_blocks(x).mean(axis=-1) for x in (image.values.astype(float), true_m))
         error = m / m[0, 0] - t / t[0, 0]
         noise = np.sqrt((_blocks(image.errors.astype(float)) ** 2).mean(axis=-1)) / BLOCK / m[0, 0]
-    off = _blocks(found - truth.xi0)
+    off = _blocks(estimate - truth.xi0)
     return TrueError(
         np.where(inside, error, np.nan),
         np.where(inside, off.mean(axis=-1), np.nan),
         _rms(np.where(inside, noise, np.nan).reshape(16, -1)[1:]),
-        _rms(np.where(inside, np.sqrt((_blocks(found_error) ** 2).mean(axis=-1)) / BLOCK, np.nan)),
+        _rms(np.where(inside, np.sqrt((_blocks(sigma) ** 2).mean(axis=-1)) / BLOCK, np.nan)),
     )
 
 

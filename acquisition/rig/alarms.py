@@ -68,12 +68,12 @@ def keep(what: str, name: str, text: str) -> str:
 
 def unacknowledged() -> list[Alarm]:
     """The alarms that nobody has acknowledged, the oldest first."""
-    found = []
+    pending = []
     for path in folder().glob("alarm-*.json") if _is_own(folder()) else ():
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             content = json.loads(path.read_text(encoding="utf-8"))
-            found.append(Alarm(path, str(content["rig"]), str(content["time"]), str(content["text"])))
-    return sorted(found, key=lambda alarm: alarm.time)
+            pending.append(Alarm(path, str(content["rig"]), str(content["time"]), str(content["text"])))
+    return sorted(pending, key=lambda alarm: alarm.time)
 
 
 def acknowledge(alarm: Alarm) -> None:

@@ -25,14 +25,14 @@ def unwound(table: StateTable, rig: Rig, here_deg: Mapping[str, float] | None = 
     ----------
     here_deg : where the axes stand; None for where they stand once those without a reference are homed.
     """
-    here = rig.where_once_homed() if here_deg is None else here_deg
+    start_deg = rig.where_once_homed() if here_deg is None else here_deg
     ahead = {}
     for name in _endless(table, rig):
-        if name in here and np.ptp(table.angles_deg[name]) > 0:
-            turns = math.ceil((here[name] - 1e-3 - float(table.angles_deg[name].min())) / 360.0)
-            if turns > 0 and here[name] < UP_TO_DEG:
+        if name in start_deg and np.ptp(table.angles_deg[name]) > 0:
+            turns = math.ceil((start_deg[name] - 1e-3 - float(table.angles_deg[name].min())) / 360.0)
+            if turns > 0 and start_deg[name] < UP_TO_DEG:
                 ahead[name] = turns
-    return turned(table, turns_to(table, rig, 0, here, wanted=ahead))
+    return turned(table, turns_to(table, rig, 0, start_deg, wanted=ahead))
 
 
 def turned(table: StateTable, turns: Mapping[str, int]) -> StateTable:
@@ -53,8 +53,8 @@ def turns_to(
     names = _endless(table, rig)
     choices = []
     for name in names:
-        there = round((here_deg.get(name, 0.0) - float(table.angles_deg[name][state])) / 360.0)
-        choices.append(list(dict.fromkeys([wanted.get(name, 0), there, there + 1, there - 1, 0])))
+        nearest = round((here_deg.get(name, 0.0) - float(table.angles_deg[name][state])) / 360.0)
+        choices.append(list(dict.fromkeys([wanted.get(name, 0), nearest, nearest + 1, nearest - 1, 0])))
     for chosen in product(*choices):
         turns = dict(zip(names, chosen, strict=True))
         by = states_deg(turned(table, turns))

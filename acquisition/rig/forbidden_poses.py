@@ -83,8 +83,8 @@ def _leaves(
     for axis in moving:
         start, up = start_deg[axis], end_deg[axis] > start_deg[axis]
         low, high = _nearest_copy(box.ranges_deg[axis], start)
-        way, other = (high - start, start - low) if up else (start - low, high - start)
-        shortest = way <= other + EDGE_DEG or not _can_reach(limits.get(axis), low if up else high)
+        way, other_way = (high - start, start - low) if up else (start - low, high - start)
+        shortest = way <= other_way + EDGE_DEG or not _can_reach(limits.get(axis), low if up else high)
         if way <= EDGE_DEG or (moving == [axis] and shortest):
             outside[axis] = math.nextafter(high, math.inf) if up else math.nextafter(low, -math.inf)
     return outside != start_deg and not touches(box, spanned(outside, end_deg))

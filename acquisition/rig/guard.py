@@ -86,7 +86,7 @@ class Guard:
 
     def watch(self, line: socket.socket) -> bool:
         """Listen until `acquire` ends; True if it ended in order, and False once everything was shut in its place."""
-        silent_s, beat, rest = 0.0, 0, b""
+        silent_s, beat, tail = 0.0, 0, b""
         noted_s = before_s = time.monotonic()
         self.journal.note("guard watches", pid=self.pid, rig=self.config.name)
         self._say(line, watching=True)
@@ -100,7 +100,7 @@ class Guard:
                 if not data:
                     return self._act("acquire died", beat)
                 self._has_shut = False
-                *lines, rest = (rest + data).split(b"\n")
+                *lines, tail = (tail + data).split(b"\n")
                 for text in lines:
                     message = json.loads(text)
                     if "beat" in message:
@@ -166,10 +166,10 @@ class Guard:
                     alarm.repeat()
                 self.journal.flush()
                 time.sleep(LOOK_S)
-        said = "light shut" if light.result() is None else f"LIGHT NOT SHUT: {light.result()}"
+        outcome = "light shut" if light.result() is None else f"LIGHT NOT SHUT: {light.result()}"
         if self.config.source is None:
-            said = "this rig has no source to shut"
-        text = f"{why}. The guard: {said}, {axes.result()}. Continue with --resume, or the same campaign"
+            outcome = "this rig has no source to shut"
+        text = f"{why}. The guard: {outcome}, {axes.result()}. Continue with --resume, or the same campaign"
         if alarm is None and light.result() is None and axes.result() == AT_REST:
             self.call(text)
             return False
@@ -235,13 +235,13 @@ class Guard:
                 if stop_axes(self.config, lambda text: self.journal.note("axis", told=text), let_go=(self.pid,)):
                     self.journal.note(AT_REST)
                     return AT_REST
-                told = "AXES NOT AT REST"
+                outcome = "AXES NOT AT REST"
             except Exception as error:  # noqa: BLE001 - whatever it is, the light and the alarm do not wait for it
-                told = f"AXES NOT STOPPED: {error}"
-            self.journal.note(told)
-            self._axes_problem = told
+                outcome = f"AXES NOT STOPPED: {error}"
+            self.journal.note(outcome)
+            self._axes_problem = outcome
             if time.monotonic() - begin_s > TRY_S:
-                return told
+                return outcome
             time.sleep(AGAIN_S)
 
     # --- words -------------------------------------------------------------------------------------------
@@ -354,12 +354,12 @@ def main() -> None:
             return
         first += byte
     hello = json.loads(first)
-    own = parse_yaml(hello["rig"], RigConfig, source="rig")
+    config = parse_yaml(hello["rig"], RigConfig, source="rig")
     journal = Journal(Path(hello["log"]) if hello["log"] else None)
     if hello["before"]:
         journal.note("guard restarted", before=hello["before"])
     held = dict(zip(hello["ports"], descriptors, strict=False))
-    guard = Guard(with_held_ports(own, held), hello["pid"], journal, own)
+    guard = Guard(with_held_ports(config, held), hello["pid"], journal, config)
     guard.open_cutoff()
     in_order = guard.watch(line)
     # The next program may want the ports while a slow disc still takes the last words.

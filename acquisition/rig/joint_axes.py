@@ -52,9 +52,9 @@ class JointAxes:
         MotionFailed
             Every axis has been sent a stop by then.
         """
-        found = find_homing_obstacle(self.config, names, self.where_known())
-        if found is not None:
-            raise AcquisitionError(f"{found}. Nothing was moved.")
+        obstacle = find_homing_obstacle(self.config, names, self.where_known())
+        if obstacle is not None:
+            raise AcquisitionError(f"{obstacle}. Nothing was moved.")
         for name in names:
             self.wait({name: self.axes[name].home()})
 
@@ -111,9 +111,9 @@ class JointAxes:
         return motions
 
     def _check_way(self, targets_deg: Mapping[str, float]) -> None:
-        found = self._met(targets_deg)
-        if found is not None:
-            raise AcquisitionError(f"move to {dict(targets_deg)} meets {found}. Nothing was moved.")
+        obstacle = self._met(targets_deg)
+        if obstacle is not None:
+            raise AcquisitionError(f"move to {dict(targets_deg)} meets {obstacle}. Nothing was moved.")
 
     def is_free(self, targets_deg: Mapping[str, float]) -> bool:
         """Whether the axes can move there straight away."""
@@ -123,8 +123,8 @@ class JointAxes:
         if not concerned(self.config) & targets_deg.keys():
             # Not even a position is read then: most moves are of rotators that nothing can hit.
             return None
-        here = self.where_known()
-        return find_obstacle(self.config, here, here | dict(targets_deg), targets_deg, limits=self.limits)
+        pose = self.where_known()
+        return find_obstacle(self.config, pose, pose | dict(targets_deg), targets_deg, limits=self.limits)
 
     @property
     def limits(self) -> dict[str, Limits]:
@@ -156,21 +156,21 @@ class JointAxes:
         MotionFailed
             As the first axis that failed has it; every axis has been sent a stop.
         """
-        left = dict(motions)
+        pending = dict(motions)
         positions: dict[str, Position] = {}
         start_s = self.clock.now_s()
         try:
-            while left:
-                for name, motion in list(left.items()):
+            while pending:
+                for name, motion in list(pending.items()):
                     if motion.done():
                         positions[name] = motion.wait()
-                        del left[name]
-                if left:
-                    self.clock.sleep_s(self._next_look_s(left, self.clock.now_s() - start_s))
+                        del pending[name]
+                if pending:
+                    self.clock.sleep_s(self._next_look_s(pending, self.clock.now_s() - start_s))
         except MotionFailed as failure:
-            others = self.stop()
-            if others is not None:
-                failure.add_note(f"stopping the other axes failed too: {others}")
+            stop_error = self.stop()
+            if stop_error is not None:
+                failure.add_note(f"stopping the other axes failed too: {stop_error}")
             raise
         except BaseException:
             self.stop()

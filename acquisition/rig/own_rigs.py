@@ -43,9 +43,9 @@ def is_own_rig(file: Path) -> bool:
 
 def own_campaign(folder: Path) -> tuple[Path, Path] | None:
     """Campaign file and rig file with which the user began the campaign in a folder; None for somebody else's."""
-    found = _entries("campaigns").get(str(folder.resolve()))
-    if isinstance(found, list) and len(found) == 2 and all(isinstance(file, str) for file in found):
-        return Path(found[0]), Path(found[1])
+    files = _entries("campaigns").get(str(folder.resolve()))
+    if isinstance(files, list) and len(files) == 2 and all(isinstance(file, str) for file in files):
+        return Path(files[0]), Path(files[1])
     return None
 
 
@@ -56,18 +56,18 @@ def _entries(kind: str) -> dict[str, Any]:
 
 def _read() -> dict[str, Any]:
     with contextlib.suppress(ProcessError):
-        found = read_json(list_file())
-        return found if isinstance(found, dict) else {}
+        content = read_json(list_file())
+        return content if isinstance(content, dict) else {}
     return {}
 
 
 def _note(kind: str, key: str, value: Any) -> None:
     entries = {key: value} | {k: v for k, v in _entries(kind).items() if k != key}
-    kept = _read() | {kind: dict(list(entries.items())[:MOST])}
+    content = _read() | {kind: dict(list(entries.items())[:MOST])}
     file = list_file()
     new = file.with_name(f"{file.name}.{os.getpid()}")
     # Without a home folder nothing is noted, and `--rig` has to be given.
     with contextlib.suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True)
-        new.write_text(json.dumps(kept, indent=1), encoding="utf-8")
+        new.write_text(json.dumps(content, indent=1), encoding="utf-8")
         os.replace(new, file)

@@ -318,11 +318,11 @@ class Rig(JointAxes):
     def set_exposure(self, exposure_s: float, repeats: int) -> CameraSettings:
         """Set exposure and averaging, unless they are set so already; returns the settings as read back."""
         # The trigger is that of the rig file.
-        asked = CameraSettings(exposure_s=exposure_s, frame_average=repeats)
-        if self._asked != asked:
+        settings = CameraSettings(exposure_s=exposure_s, frame_average=repeats)
+        if self._asked != settings:
             self._asked = None
-            self._read_back = self.require_camera().configure(asked)
-            self._asked = asked
+            self._read_back = self.require_camera().configure(settings)
+            self._asked = settings
         return self._read_back
 
     def forget_exposure(self) -> None:

@@ -117,14 +117,14 @@ def _shared_places(rig: RigSections) -> Iterator[Mistake]:
             yield (*where, "port"), f"{entry.kind} at the port of {owner}, a {first_kind}: one line, one protocol"
             continue
         place = entry.place() if isinstance(entry, AxisConfig) else ""
-        other = places.setdefault((port, place), name)
-        if other != name:
-            yield where, f"at the same port{' and ' + place if place else ''} as {other}: one device cannot be both"
+        holder = places.setdefault((port, place), name)
+        if holder != name:
+            yield where, f"at the same port{' and ' + place if place else ''} as {holder}: one device cannot be both"
     emulated: dict[Any, str] = {}
     for name, axis in rig.simulator.axes.items() if rig.simulator else ():
-        other = emulated.setdefault((axis.port, axis.index), name)
-        if other != name:
-            yield ("simulator", "axes", name), f"the same emulated axis as {other}"
+        holder = emulated.setdefault((axis.port, axis.index), name)
+        if holder != name:
+            yield ("simulator", "axes", name), f"the same emulated axis as {holder}"
 
 
 def _devices_with_port(rig: RigSections) -> Iterator[tuple[tuple[str, ...], str, Any]]:
@@ -155,20 +155,20 @@ def _given_angles(rig: RigSections) -> Iterator[tuple[tuple[int | str, ...], str
     for name, angle in rig.park_deg.items():
         yield ("park_deg", name), name, angle
     for mode, config in rig.modes.items():
-        for name, given in config.pose_deg.items():
-            for angle in given.values() if isinstance(given, dict) else (given,):
+        for name, angles in config.pose_deg.items():
+            for angle in angles.values() if isinstance(angles, dict) else (angles,):
                 yield ("modes", mode, "pose_deg", name), name, angle
 
 
 def _wavelengths(rig: RigSections) -> Iterator[Mistake]:
-    given = rig.wavelengths_nm
-    for k, wavelength in enumerate(given):
-        if wavelength in given[:k]:
+    wavelengths = rig.wavelengths_nm
+    for k, wavelength in enumerate(wavelengths):
+        if wavelength in wavelengths[:k]:
             yield ("wavelengths_nm", k), f"{wavelength:g} nm is there twice"
     for mode, config in rig.modes.items():
         for axis, angles in config.pose_deg.items():
             for wavelength in angles if isinstance(angles, dict) else ():
-                if wavelength not in given:
+                if wavelength not in wavelengths:
                     where = ("modes", mode, "pose_deg", axis)
                     yield where, f"{wavelength:g} nm is none of `wavelengths_nm`"
     if rig.exposure_s[0] <= 0:
@@ -194,8 +194,8 @@ def _interlocks(rig: RigSections) -> Iterator[Mistake]:
         if entry.kind == "door" and entry.limit:
             yield ("interlocks", k), "door: it is open or closed and has no limit"
         if entry.kind in ("temperature", "drift", "lamp") and entry.limit == 0:
-            kept = "always" if entry.kind == "lamp" else "never"
-            yield ("interlocks", k), f"{entry.kind}: limit 0 is {kept} kept; give a limit"
+            frequency = "always" if entry.kind == "lamp" else "never"
+            yield ("interlocks", k), f"{entry.kind}: limit 0 is {frequency} kept; give a limit"
         if entry.kind in ("lamp", "saturation", "drift") and entry.limit >= 1:
             yield ("interlocks", k), f"{entry.kind}: limit {entry.limit:g} is a fraction, less than 1"
         if entry.kind == "temperature" and entry.limit > HOTTEST_C:
@@ -213,13 +213,13 @@ def _ways(rig: RigSections) -> Iterator[Mistake]:
     """Parking and homing against forbidden poses and solids; asked only of names that are all there."""
     if any(name not in rig.axes for _, name in _named_axes(rig)):
         return
-    found = _park_meets(rig)
-    if found is not None:
-        yield ("park_deg",), f"parking there meets {found}"
+    obstacle = _park_meets(rig)
+    if obstacle is not None:
+        yield ("park_deg",), f"parking there meets {obstacle}"
     order: Iterable[str] = [*rig.home_order, *(name for name in rig.axes if name not in rig.home_order)]
-    found = find_homing_obstacle(rig, order, {})
-    if found is not None:
-        yield ("homing",), found
+    obstacle = find_homing_obstacle(rig, order, {})
+    if obstacle is not None:
+        yield ("homing",), obstacle
 
 
 def _park_meets(rig: RigSections) -> str | None:

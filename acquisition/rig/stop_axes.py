@@ -42,16 +42,16 @@ def stop_axes(config: RigConfig, tell: Tell, let_go: Collection[int] = ()) -> bo
     lines: dict[str, dict[str, AxisConfig]] = {}
     for name, entry in config.axes.items():
         lines.setdefault(os.path.realpath(entry.port), {})[name] = entry
-    told = set(let_go) or _tell_running(list(lines), tell)
+    pids = set(let_go) or _tell_running(list(lines), tell)
     with LineRegistry(clock=clock_of(config)) as registry, ThreadPoolExecutor(max(1, len(lines))) as threads:
-        stopped = threads.map(lambda port: _stop_line(port, lines[port], registry, told, tell=tell), lines)
+        stopped = threads.map(lambda port: _stop_line(port, lines[port], registry, pids, tell=tell), lines)
         return all(list(stopped))
 
 
 def _tell_running(ports: list[str], tell: Tell) -> set[int]:
     """Signal every running `acquire` that holds one of the ports; returns their process ids."""
     holders = {pid: who for port in ports for pid, who in port_holders(port) if pid != os.getpid()}
-    told = set()
+    pids = set()
     for pid, who in holders.items():
         if not _is_acquire(pid):
             tell(f"{who} holds a port of this rig; it is not acquire and gets no signal")
@@ -66,8 +66,8 @@ def _tell_running(ports: list[str], tell: Tell) -> set[int]:
             tell(f"{who} measures on this rig under another user: stop it there, with Ctrl-C twice")
             continue
         tell(f"{who} measures on this rig: asked to stop at once, as by Ctrl-C twice")
-        told.add(pid)
-    return told
+        pids.add(pid)
+    return pids
 
 
 def _is_acquire(pid: int) -> bool:

@@ -78,29 +78,29 @@ def find_way(
     """
     places = dict(target_deg) | dict(start_deg)
     if first is not None and first in target_deg and len(target_deg) > 1:
-        alone = {first: target_deg[first]}
-        others = {name: angle for name, angle in target_deg.items() if name != first}
-        both = ((places, alone), (places | alone, others))
-        if all(find_obstacle(rig, here, here | move, move, limits=limits) is None for here, move in both):
-            return [alone, others]
-    asked = [name for name in concerned(rig) if name in places]
-    turning = [name for name in asked if abs(target_deg.get(name, places[name]) - places[name]) > EDGE_DEG]
-    start = {name: places[name] for name in asked}
-    end = start | {name: target_deg[name] for name in asked if name in target_deg}
+        first_move = {first: target_deg[first]}
+        second_move = {name: angle for name, angle in target_deg.items() if name != first}
+        legs = ((places, first_move), (places | first_move, second_move))
+        if all(find_obstacle(rig, origin, origin | move, move, limits=limits) is None for origin, move in legs):
+            return [first_move, second_move]
+    axes = [name for name in concerned(rig) if name in places]
+    turning = [name for name in axes if abs(target_deg.get(name, places[name]) - places[name]) > EDGE_DEG]
+    start = {name: places[name] for name in axes}
+    end = start | {name: target_deg[name] for name in axes if name in target_deg}
     if len(turning) > MOST_AXES:
         turning = []
     corners = product(*((start[name], end[name]) for name in turning))
     nodes = [end, *(start | dict(zip(turning, corner, strict=True)) for corner in corners)]
-    nodes += [start | {name: pose[name] for name in asked if name in pose} for pose in by]
+    nodes += [start | {name: pose[name] for name in axes if name in pose} for pose in by]
     came_from: dict[int, int | None] = {}
     reached = deque[int]()
 
     def reach(from_node: int | None) -> None:
-        here = start if from_node is None else nodes[from_node]
+        origin = start if from_node is None else nodes[from_node]
         for node, pose in enumerate(nodes):
             if node not in came_from:
-                moving = [name for name in asked if pose[name] != here[name]]
-                if find_obstacle(rig, here, pose, moving, limits=limits) is None:
+                moving = [name for name in axes if pose[name] != origin[name]]
+                if find_obstacle(rig, origin, pose, moving, limits=limits) is None:
                     came_from[node] = from_node
                     reached.append(node)
                     if node == 0:
@@ -116,7 +116,7 @@ def find_way(
         poses.insert(0, nodes[node])
         node = came_from[node]
     detour = zip([start, *poses], poses[:-1], strict=False)
-    turned = [{name: pose[name] for name in asked if pose[name] != before[name]} for before, pose in detour]
+    turned = [{name: pose[name] for name in axes if pose[name] != before[name]} for before, pose in detour]
     return [*turned, dict(target_deg)]
 
 
@@ -134,18 +134,18 @@ def find_homing_obstacle(rig: RigSections, names: Iterable[str], here_deg: Mappi
     here_deg : where the axes that have a reference stand; the others may be anywhere.
     """
     # Limits of the rig file do not bind a controller that looks for its switch.
-    here = {axis: (angle, angle) for axis, angle in here_deg.items()}
+    ranges = {axis: (angle, angle) for axis, angle in here_deg.items()}
     for name in names:
         path = rig.homing.get(name)
-        ways = here | {name: path.passes_deg if path else ANYWHERE}
-        found = _met_homing(rig, name, ways)
-        if found is not None:
+        ways = ranges | {name: path.passes_deg if path else ANYWHERE}
+        obstacle = _met_homing(rig, name, ways)
+        if obstacle is not None:
             hint = "" if path else f". If it cannot get there, say which angles it passes, in `homing: {{{name}: ...}}`"
-            return f"homing {name} may meet {found}{hint}"
+            return f"homing {name} may meet {obstacle}{hint}"
         if path is not None:
-            here[name] = (path.ends_deg, path.ends_deg)
+            ranges[name] = (path.ends_deg, path.ends_deg)
         else:
-            here.pop(name, None)
+            ranges.pop(name, None)
     return None
 
 

@@ -97,8 +97,8 @@ class Shown:
         with self._drawing:
             if name not in drawn:
                 drawn[name] = draw()
-            found: Drawn = drawn[name]
-            return found
+            picture: Drawn = drawn[name]
+            return picture
 
     _drawing: ClassVar[threading.Lock] = threading.Lock()
 

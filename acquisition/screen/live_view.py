@@ -57,8 +57,8 @@ class LiveView(Observer):
         self._settings = {"token": token, "black": black, "full_scale": full_scale, "simulated": simulated}
 
     def __enter__(self) -> Self:
-        self._link, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        passed = [self._listener.fileno(), other.fileno(), self._memory]
+        self._link, child_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        passed = [self._listener.fileno(), child_end.fileno(), self._memory]
         self.process = subprocess.Popen(
             [sys.executable, "-m", "acquisition.screen.live_process", *map(str, passed)],
             pass_fds=passed,
@@ -67,7 +67,7 @@ class LiveView(Observer):
             # Ctrl-C in the terminal is for the measuring program.
             start_new_session=True,
         )
-        other.close()
+        child_end.close()
         self._listener.close()
         self._send(self._settings)
         self._hearing = threading.Thread(target=self._hear, name="live view", daemon=True)
