@@ -80,10 +80,10 @@ def patient_clock() -> PatientClock:
     clock = PatientClock()
 
     def keep_going() -> None:
-        with clock.attend() as here:
+        with clock.attend() as check_in:
             while True:
                 time.sleep(BEAT_S)
-                here()
+                check_in()
 
     threading.Thread(target=keep_going, name="patient clock", daemon=True).start()
     return clock

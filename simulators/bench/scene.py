@@ -193,8 +193,8 @@ class Scene:
         for key, value in spec.surface.items():
             if abs(key - wavelength_nm) < 0.5:
                 return value
-        known = ", ".join(f"{k:g}" for k in spec.surface)
-        raise ConfigError(f"scene {spec.name!r} is given at {known} nm, not at {wavelength_nm:g} nm")
+        listing = ", ".join(f"{k:g}" for k in spec.surface)
+        raise ConfigError(f"scene {spec.name!r} is given at {listing} nm, not at {wavelength_nm:g} nm")
 
     def _points(self, surface: Surface, image: GeometryImage, wavelength_nm: float) -> RealArray:
         optics = self.optics

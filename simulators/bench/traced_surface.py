@@ -42,8 +42,8 @@ class TracedSurface:
         facet = facet / np.sqrt(_dot(facet, facet))[..., None]
         # Two beams at once, polarized along x and y of the generator.
         fields = np.stack(_axes(-g.to_source)).astype(complex)
-        seen = _mirrored(fields, g.to_source, facet, complex(c.n, c.k))
-        out = np.stack([_dot(seen, axis) for axis in _axes(g.to_camera)])
+        reflected = _mirrored(fields, g.to_source, facet, complex(c.n, c.k))
+        out = np.stack([_dot(reflected, axis) for axis in _axes(g.to_camera)])
         if a := getattr(c, "a", 0.0):
             u, sine = _outwards(g, facet)
             weight = a * sine**c.b
@@ -111,5 +111,5 @@ def _axes(k: Array) -> tuple[Array, Array]:
 def _stokes(e: ComplexArray) -> Array:
     """Stokes vector (..., 4) of fields (..., 2), decreasing phase: right circular is (1, -i)/sqrt 2."""
     x, y = e[..., 0], e[..., 1]
-    power_x, power_y, both = np.abs(x) ** 2, np.abs(y) ** 2, x * np.conj(y)
-    return np.stack([power_x + power_y, power_x - power_y, 2 * both.real, 2 * both.imag], axis=-1)
+    power_x, power_y, cross = np.abs(x) ** 2, np.abs(y) ** 2, x * np.conj(y)
+    return np.stack([power_x + power_y, power_x - power_y, 2 * cross.real, 2 * cross.imag], axis=-1)

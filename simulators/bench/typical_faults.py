@@ -74,8 +74,8 @@ class TypicalFault:
         draw = Draw(float(f"{sign * size:.3g}"), axis, order, phase_deg, state)
         settings = self.settings(draw)
         place = settings.get("element") or settings.get("axis")
-        told = f"{draw.size:g} {self.unit}" + (f", {place}" if place else "")
-        return _READ.validate_python(settings), told
+        description = f"{draw.size:g} {self.unit}" + (f", {place}" if place else "")
+        return _READ.validate_python(settings), description
 
     def example(self) -> BenchEffect:
         """A fault of middle size on the generator's plate."""

@@ -82,8 +82,8 @@ def write_virtual_capture(
         )
         frames = h5["entry/instrument/detector/data"]
         for k in range(len(role)):
-            here = {axis: float(values[k]) for axis, values in angles.items()}
-            frames[k, 0] = bench.expose(here, exposure_s, k, light=k >= darks, omega_deg=omega_deg)
+            pose = {axis: float(values[k]) for axis, values in angles.items()}
+            frames[k, 0] = bench.expose(pose, exposure_s, k, light=k >= darks, omega_deg=omega_deg)
             for axis in axes:
                 h5[f"entry/instrument/{axis}/value"][k] = angles[axis][k]
         h5["entry/states/exposure_s"][...] = exposure_s

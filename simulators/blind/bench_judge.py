@@ -159,10 +159,10 @@ def _is_true(text: str, capture: str | None, faults: Sequence[TrueFault]) -> boo
 
 def _names(text: str, capture: str | None, fault: TrueFault) -> bool:
     """Whether a name, "kind" or "kind[place]", is that of a fault."""
-    found = NAME.match(text)
-    if found is None:
+    match = NAME.match(text)
+    if match is None:
         return False
-    kind, place = found["kind"], found["place"]
+    kind, place = match["kind"], match["place"]
     if capture is not None and fault.capture is not None and capture.partition(" ")[0] != fault.capture:
         return False
     if kind in TRUE_AS_WELL.get(fault.kind, ()):
@@ -175,24 +175,24 @@ def told_of(result: Result, truth: RealBench, given: Sequence[str]) -> tuple[Mat
     out = []
     for fault in active(truth, given):
         size = max((v for c, v in fault.matters.items() if c in (*given, VALIDATION)), default=0.0)
-        told = "missed"
+        outcome = "missed"
         for effect in result["effects"]:
             if _certainty(effect) == "unknown":
                 continue
             if _names(f"{effect['kind']}[{effect['element'] or ''}]", effect.get("capture"), fault):
-                told = "named"
+                outcome = "named"
                 break
             if any(_names(text, effect.get("capture"), fault) for text in effect["indistinguishable_from"]):
-                told = "in a set"
+                outcome = "in a set"
         label = f"{fault.kind}[{fault.place}]" + (f" in {fault.capture}" if fault.capture else "")
-        out.append(Matter(label, size, told))
+        out.append(Matter(label, size, outcome))
     return tuple(out)
 
 
 def wiring_of(result: Result, truth: RealBench) -> tuple[TrueCause, ...]:
     """The mistake of wiring that is told, against the truth."""
-    told = result.get("wiring")
-    if not told:
+    text = result.get("wiring")
+    if not text:
         return ()
-    right = any(WIRING_WORDS[f.kind] in told for f in truth.faults if f.kind in WIRING_WORDS)
-    return (TrueCause(told, "sure", WORDS["sure"], right, right),)
+    right = any(WIRING_WORDS[f.kind] in text for f in truth.faults if f.kind in WIRING_WORDS)
+    return (TrueCause(text, "sure", WORDS["sure"], right, right),)

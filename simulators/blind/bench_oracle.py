@@ -33,12 +33,12 @@ def fit_of_the_truth(
     data = []
     for path in captures:
         with Capture(path) as capture:
-            there = model.at(capture.header.wavelength_nm)
-            data.append(screened(read_capture(capture, there), there, lambda line: None))
+            instrument = model.at(capture.header.wavelength_nm)
+            data.append(screened(read_capture(capture, instrument), instrument, lambda line: None))
     problem = InstrumentProblem(model.at(data[0].wavelength_nm), data)
     numbers = {path.stem: k for k, path in enumerate(captures)}
-    wanted = {(f.kind, f.place, numbers.get(f.capture) if f.capture else None) for f in faults}
-    space = Space(tuple(_as_drawn(c) for c in problem.pool() if (c.kind, c.place, c.capture) in wanted))
+    keys = {(f.kind, f.place, numbers.get(f.capture) if f.capture else None) for f in faults}
+    space = Space(tuple(_as_drawn(c) for c in problem.pool() if (c.kind, c.place, c.capture) in keys))
     if not space.size:
         return None
     fit = minimize(problem, space, np.zeros(space.size))
@@ -51,16 +51,16 @@ def fit_of_the_truth(
 def known_oracle(folder: Path, truth: RealBench, configs: Path, given: str) -> float:
     """Error of M / m00 of the validation sample after a fit of the true set; kept beside the truth once it is known."""
     away = folder / "truth" / truth.name
-    kept = away / f"oracle_{given}.json"
-    if kept.exists():
-        return float(json.loads(kept.read_text(encoding="utf-8")))
+    cache = away / f"oracle_{given}.json"
+    if cache.exists():
+        return float(json.loads(cache.read_text(encoding="utf-8")))
     captures = [folder / truth.name / f"{name}.h5" for name in GIVEN[given]]
     declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
     best = fit_of_the_truth(captures, declared, active(truth, GIVEN[given]))
     error = float("nan")
     if best is not None:
         error = error_of(away / f"{VALIDATION}.h5", best, np.load(away / f"{VALIDATION}.npy").astype(float))
-    kept.write_text(json.dumps(error), encoding="utf-8")
+    cache.write_text(json.dumps(error), encoding="utf-8")
     return error
 
 

@@ -42,14 +42,14 @@ def sure_and_wrong(j: BenchJudgement) -> list[TrueCause]:
 def reliability(judgements: Sequence[BenchJudgement]) -> list[Bin]:
     """Told against true, by probability; a cause is true if it or another of its set is there."""
     causes = [c for j in judgements for c in j.causes if c.certainty != "unknown"]
-    told = np.array([c.probability for c in causes])
+    p = np.array([c.probability for c in causes])
     true = np.array([c.right_set for c in causes], dtype=float)
-    which = np.clip(np.digitize(told, BINS) - 1, 0, len(BINS) - 2)
+    bin_of = np.clip(np.digitize(p, BINS) - 1, 0, len(BINS) - 2)
     bins = []
     for k, (low, high) in enumerate(pairwise(BINS)):
-        here = which == k
-        if here.any():
-            bins.append(Bin(low, high, int(here.sum()), float(told[here].mean()), float(true[here].mean())))
+        mask = bin_of == k
+        if mask.any():
+            bins.append(Bin(low, high, int(mask.sum()), float(p[mask].mean()), float(true[mask].mean())))
     return bins
 
 
@@ -76,15 +76,15 @@ def table(judgements: Sequence[BenchJudgement]) -> str:
 
 
 def _matrix_lines(judgements: Sequence[BenchJudgement]) -> list[str]:
-    known = [j for j in judgements if np.isfinite(j.oracle)]
+    fitted = [j for j in judgements if np.isfinite(j.oracle)]
     lines = []
     for name in ("declared", "corrected", "oracle"):
         values = [getattr(j, name) for j in judgements]
         if np.isfinite(values).any():
             low, middle, high = np.nanpercentile(values, [10, 50, 90])
             lines.append(f"error of M/m00, {name}: median {middle:.5f} ({low:.5f} to {high:.5f})")
-    reached, nearly = ([j.corrected <= times * j.oracle + FLOOR for j in known] for times in (REACHED, NEARLY))
-    own = [any(is_worse(*pair) for pair in j.own.values()) for j in judgements]
+    reached, nearly = ([j.corrected <= times * j.oracle + FLOOR for j in fitted] for times in (REACHED, NEARLY))
+    worse = [any(is_worse(*pair) for pair in j.own.values()) for j in judgements]
     reduced = [j for j in judgements if np.isfinite(j.coverage_pixels)]
     patches = 100 * sum(j.coverage_patches for j in reduced) / max(len(reduced), 1)
     pixels = 100 * sum(j.coverage_pixels for j in reduced) / max(len(reduced), 1)
@@ -93,20 +93,20 @@ def _matrix_lines(judgements: Sequence[BenchJudgement]) -> list[str]:
         f"at most {REACHED} times the fit with the true set: {_share(reached)} (goal 90 %); "
         f"{NEARLY:g} times: {_share(nearly)}",
         f"M worse than uncorrected: {sum(is_worse(j.declared, j.corrected) for j in judgements)} (goal 0); "
-        f"of the captures themselves: {sum(own)}",
+        f"of the captures themselves: {sum(worse)}",
         f"within 95 % intervals: {patches:.1f} % of means of patches, {pixels:.1f} % of pixels (goal 93 to 97 %)",
     ]
 
 
 def _name_lines(judgements: Sequence[BenchJudgement]) -> list[str]:
-    told = [m.told for j in judgements for m in j.matters if m.size > MATTERS]
+    outcomes = [m.told for j in judgements for m in j.matters if m.size > MATTERS]
     lines = [
         f"called sure, and right: {_by('sure', judgements, lambda c: c.right)} (goal 99 %)",
         f"called likely, and right: {_by('likely', judgements, lambda c: c.right)}",
         f"called one of a set, and right: {_by('one_of', judgements, lambda c: c.right_set)}",
         f"benches without a sure wrong name: {_share([not sure_and_wrong(j) for j in judgements])}",
-        f"faults that matter: named {_share([t == 'named' for t in told])}, "
-        f"named or in a named set {_share([t != 'missed' for t in told])} (goal 80 %)",
+        f"faults that matter: named {_share([t == 'named' for t in outcomes])}, "
+        f"named or in a named set {_share([t != 'missed' for t in outcomes])} (goal 80 %)",
     ]
     wired = [any(w.right for w in j.wiring) for j in judgements if "wiring" in j.group]
     if wired:

@@ -66,8 +66,8 @@ def draw_kinds(random: np.random.Generator) -> list[str]:
     count = int(random.integers(FAULTS[0], FAULTS[1] + 1))
     chosen: list[str] = []
     while len(chosen) < count:
-        taken = set(chosen).union(*(group for group in EXCLUSIVE if group & set(chosen)))
-        open_kinds = [k for k in PRIORS if k not in taken]
+        excluded = set(chosen).union(*(group for group in EXCLUSIVE if group & set(chosen)))
+        open_kinds = [k for k in PRIORS if k not in excluded]
         weights = np.array([PRIORS[k].weight for k in open_kinds])
         chosen.append(str(random.choice(open_kinds, p=weights / weights.sum())))
     return chosen

@@ -75,12 +75,12 @@ class Reduced:
         """How often the truth is in the interval of noise and systematic error."""
         off = self.values - truth.reshape(16, *self.lit.shape)[1:]
         inside = np.abs(off) <= INTERVAL * np.hypot(self.noise, self.systematic)
-        whole = np.asarray(_patches(self.lit).all(axis=-1))
+        is_full = np.asarray(_patches(self.lit).all(axis=-1))
         # Noise of pixels is independent, an error of the instrument is common to them.
         noise = np.sqrt((_patches(self.noise) ** 2).sum(axis=-1)) / PATCH**2
         sigma = np.hypot(noise, _patches(self.systematic).mean(axis=-1))
         means = np.abs(_patches(off).mean(axis=-1)) <= INTERVAL * sigma
-        return Coverage(float(inside[:, self.lit].mean()), float(means[:, whole].mean()))
+        return Coverage(float(inside[:, self.lit].mean()), float(means[:, is_full].mean()))
 
 
 def error_of(path: Path, model: InstrumentModel, truth: Array) -> float:

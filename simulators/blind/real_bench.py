@@ -148,17 +148,17 @@ class _Draw:
     states: int
 
     def apply(self, bench: TrueBench, capture: str) -> TrueFault | None:
-        own = self.kind in OF_THE_CAPTURE
+        is_local = self.kind in OF_THE_CAPTURE
         # Another sample is measured later: what is a capture's own is not known of it, and does not act in it.
-        if own and (capture == VALIDATION or (self.kind in ONCE and capture != self.once)):
+        if is_local and (capture == VALIDATION or (self.kind in ONCE and capture != self.once)):
             return None
         bench.axis = self.axis
-        random = np.random.default_rng([self.seed, FITTED.index(capture)] if own else self.seed)
+        random = np.random.default_rng([self.seed, FITTED.index(capture)] if is_local else self.seed)
         if self.kind in PRIORS:
             truth: Truth = LISTED[self.kind](bench, random, self.states, PRIORS[self.kind].sizes)
         else:
             truth = ONE_THING[self.kind](bench, random, self.states)
-        return TrueFault(truth.kind, truth.place, truth.parameters, capture if own else None)
+        return TrueFault(truth.kind, truth.place, truth.parameters, capture if is_local else None)
 
 
 def make_bench(
@@ -180,9 +180,9 @@ def make_bench(
     """
     random = np.random.default_rng([seed, 8128])
     name, mosaic = f"{group}_{seed:04d}", group.startswith("mosaic")
-    own, away = folder / name, folder / "truth" / name
-    own.mkdir(parents=True, exist_ok=True)
-    away.mkdir(parents=True, exist_ok=True)
+    bench_folder, truth_folder = folder / name, folder / "truth" / name
+    bench_folder.mkdir(parents=True, exist_ok=True)
+    truth_folder.mkdir(parents=True, exist_ok=True)
     polarimeter = MOSAIC if mosaic else polarimeter
     file = configs / "instruments" / polarimeter.instrument
     text, model = file.read_text(encoding="utf-8"), InstrumentModel.load(file)
@@ -207,23 +207,23 @@ def make_bench(
     def sound() -> TrueBench:
         return declared_bench(model.at(nm), nm, pixels, mosaic, electrons=electrons)
 
-    found: dict[tuple[int, str | None], TrueFault] = {}
+    true_faults: dict[tuple[int, str | None], TrueFault] = {}
     for capture, scene in scenes.items():
-        taken = _Taken(sound, draws, capture, scene, angles)
-        bench, exposed, faults = taken.exposed()
+        run = _Taken(sound, draws, capture, scene, angles)
+        bench, exposed, faults = run.exposed()
         sample = Sample(kind="air" if capture == "air" else "unknown")
         quiet = counted(bench, expected_electrons(bench, exposed))
-        write_capture(away / f"{capture}.h5", bench, quiet, angles, sample=sample, instrument=text)
-        target = away / f"{capture}_noisy.h5" if capture == VALIDATION else own / f"{capture}.h5"
+        write_capture(truth_folder / f"{capture}.h5", bench, quiet, angles, sample=sample, instrument=text)
+        target = truth_folder / f"{capture}_noisy.h5" if capture == VALIDATION else bench_folder / f"{capture}.h5"
         write_capture(target, bench, digitize(bench, exposed, random), angles, sample=sample, instrument=text)
-        np.save(away / f"{capture}.npy", true_mueller(scene, pixels))
+        np.save(truth_folder / f"{capture}.npy", true_mueller(scene, pixels))
         for i, fault in faults.items():
-            known = found.setdefault((i, fault.capture), fault)
+            first = true_faults.setdefault((i, fault.capture), fault)
             if group in ("real", "single", "outside"):
                 w = model.at(nm).rows(angles).reshape(-1, 16)
-                known.matters[capture] = taken.matters(w, i, expected(bench, exposed))
-    truth = RealBench(name, group, seed, file.name, nm, tuple(found[k] for k in sorted(found, key=str)))
-    (away / "truth.json").write_text(json.dumps(asdict(truth), indent=1), encoding="utf-8")
+                first.matters[capture] = run.matters(w, i, expected(bench, exposed))
+    truth = RealBench(name, group, seed, file.name, nm, tuple(true_faults[k] for k in sorted(true_faults, key=str)))
+    (truth_folder / "truth.json").write_text(json.dumps(asdict(truth), indent=1), encoding="utf-8")
     return truth
 
 

@@ -105,8 +105,8 @@ class LitSupport:
             square = dot(towards, towards)
             direction = towards / np.sqrt(square)[:, None]
             # The surface's own law holds the cosine of incidence on it.
-            seen = (dot(g.normal, direction) > 0) * np.maximum(-direction[:, 1], 0.0)
-            weight = self.strength * brightness * self.area_mm2 / np.pi * seen / square
+            cosine = (dot(g.normal, direction) > 0) * np.maximum(-direction[:, 1], 0.0)
+            weight = self.strength * brightness * self.area_mm2 / np.pi * cosine / square
             from_patch = ScatteringGeometry(g.normal, direction, g.to_camera)
             m = _triply_degenerate(self.scene, surface, from_patch, wavelength_nm)
             m[..., 1:] = 0.0

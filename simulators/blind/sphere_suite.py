@@ -58,8 +58,8 @@ def drawn(kind: str, random: np.random.Generator, scene: Scene, instrument: Inst
         return nothing
     if kind == "two":
         first, second = sorted(random.choice(len(LISTED), 2, replace=False))
-        both = _with(LISTED[second], random, _with(LISTED[first], random, nothing))
-        return replace(both, kind=f"{LISTED[first]}+{LISTED[second]}")
+        pair = _with(LISTED[second], random, _with(LISTED[first], random, nothing))
+        return replace(pair, kind=f"{LISTED[first]}+{LISTED[second]}")
     if kind in LISTED:
         return replace(_with(kind, random, nothing), kind=kind)
     return replace(nothing, kind=kind, scene=_unlisted_scene(kind, random, scene))

@@ -203,8 +203,8 @@ def expose(bench: TrueBench, scene: TrueScene, angles_deg: dict[str, Array]) -> 
             moved = [(0.0, 0.0), *(s(k, angles) for s in bench.shift)]
             dx, dy = (sum(parts) for parts in zip(*moved, strict=True))
             levels = np.ones(4)
-            for which, course in bench.material_level:
-                levels[which] *= course(k)
+            for material, course in bench.material_level:
+                levels[material] *= course(k)
             m = scene.at((xs - dx) / bench.columns, (ys - dy) / bench.rows, levels)
             if bench.turned:
                 m = _turned(scene, bench, xs - dx, ys - dy, angle=sum(t(k) for t in bench.turned))
@@ -247,12 +247,12 @@ def _on_mosaic(light: Array) -> Array:
 
 def digitize(bench: TrueBench, electrons: Array, random: np.random.Generator) -> NDArray[np.uint16]:
     """Counts of expected electrons: shot noise, full well, transfer curve, read noise, black level, rounding."""
-    found = np.minimum(random.poisson(np.maximum(electrons, 0)).astype(float), bench.full_well)
+    signal = np.minimum(random.poisson(np.maximum(electrons, 0)).astype(float), bench.full_well)
     for curve in bench.transfer:
-        found = curve(found)
+        signal = curve(signal)
     for add in bench.noise:
-        found = add(found, random)
-    return counted(bench, found + bench.read_noise * random.standard_normal(found.shape))
+        signal = add(signal, random)
+    return counted(bench, signal + bench.read_noise * random.standard_normal(signal.shape))
 
 
 def counted(bench: TrueBench, electrons: Array) -> NDArray[np.uint16]:
@@ -319,10 +319,10 @@ def write_capture(
 
 def expected_electrons(bench: TrueBench, electrons: Array) -> Array:
     """Electrons (N, rows, columns) that the detector collects on average."""
-    found = np.minimum(electrons, bench.full_well)
+    signal = np.minimum(electrons, bench.full_well)
     for curve in bench.transfer:
-        found = curve(found)
-    return found
+        signal = curve(signal)
+    return signal
 
 
 def expected(bench: TrueBench, electrons: Array) -> Array:

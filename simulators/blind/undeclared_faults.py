@@ -352,8 +352,8 @@ def broad_source(bench: TrueBench, random: np.random.Generator, states: int) -> 
 
 def drying_sample(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """One of the sample's materials gets brighter or darker while it is measured."""
-    size, which = draw_signed(random, 0.02, 0.2), int(random.integers(4))
-    bench.material_level.append((which, lambda k: 1 + size * (1 - np.exp(-3 * k / states))))
+    size, material = draw_signed(random, 0.02, 0.2), int(random.integers(4))
+    bench.material_level.append((material, lambda k: 1 + size * (1 - np.exp(-3 * k / states))))
     return Truth("drying_sample")
 
 

@@ -49,9 +49,9 @@ def _zero(name: str, attribute: str, steps_deg: tuple[float, ...]) -> Fault:
 def wavelength(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """The filter in the beam is not the one that the capture file names (RGB950: 451 for 662 nm, or the reverse)."""
     retardances = {451.0: (130.01, 143.13), 662.0: (127.12, 94.78)}
-    other = next(nm for nm in retardances if nm != bench.wavelength_nm)
-    bench.dg, bench.da = np.deg2rad(retardances[other])
-    return Truth("wavelength", "", {"true_nm": other})
+    true_nm = next(nm for nm in retardances if nm != bench.wavelength_nm)
+    bench.dg, bench.da = np.deg2rad(retardances[true_nm])
+    return Truth("wavelength", "", {"true_nm": true_nm})
 
 
 WIRING: dict[str, Fault] = {

@@ -48,17 +48,17 @@ class RegisterDevice(Protocol):
 
 def _broadcast_sockets(address: str) -> list[socket.socket]:
     """Sockets that hear what is sent to all, and to all of the subnet; fewer where another program has them alone."""
-    found = []
+    sockets = []
     for everybody in ("255.255.255.255", address.split(".")[0] + ".255.255.255"):
-        heard = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        heard.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            heard.bind((everybody, PORT))
+            listener.bind((everybody, PORT))
         except OSError:
-            heard.close()
+            listener.close()
         else:
-            found.append(heard)
-    return found
+            sockets.append(listener)
+    return sockets
 
 
 class ControlChannel:

@@ -162,15 +162,15 @@ class GigeCamera:
         self._texts = texts
 
     def _free_address(self) -> int:
-        taken = []
+        registers = []
         for name in self._nodes:
             if self._nodes.node(name).tag in REGISTERS:
                 try:
-                    taken.append(self._nodes.register(name))
+                    registers.append(self._nodes.register(name))
                 except NodeError:
                     continue
         tops = range(0xFF00_0000, 0, -_MOST_XML_BYTES)
-        return next(at for at in tops if not any(register.overlaps(at, _MOST_XML_BYTES) for register in taken))
+        return next(at for at in tops if not any(register.overlaps(at, _MOST_XML_BYTES) for register in registers))
 
     # --- life --------------------------------------------------------------------------------------------
 

@@ -55,8 +55,8 @@ class LoopbackAddress:
         # Real time: whoever holds the address may be another program.
         deadline_s = time.monotonic() + wait_s
         while True:
-            others = [one for one in addresses if one != self.address] if self._elsewhere else []
-            for address in (self.address, *others):
+            fallbacks = [entry for entry in addresses if entry != self.address] if self._elsewhere else []
+            for address in (self.address, *fallbacks):
                 if (held := self._bound(address)) is not None:
                     self.address, self._held = address, held
                     return
@@ -64,7 +64,7 @@ class LoopbackAddress:
                 raise self._error(
                     f"another camera had it for {wait_s:g} s",
                     "End the other simulated camera, or give this machine one more address for it: "
-                    f"ip addr add 127.0.0.{2 + len(others)}/8 dev lo",
+                    f"ip addr add 127.0.0.{2 + len(fallbacks)}/8 dev lo",
                 )
             time.sleep(0.05)
 

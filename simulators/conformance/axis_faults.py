@@ -66,12 +66,12 @@ class AxisFaults(AxisTests):
     def test_one_late_answer_spoils_no_opening(self, kind: str) -> None:
         """On a busy machine: one answer behind the wait for it, at every place of the opening."""
         with self.served(kind) as served:
-            found = served.open().describe()
+            description = served.open().describe()
             commands = served.emulator.faults.commands
             served.lines.close()
             for place in range(1, commands + 1):
                 served.emulator.faults.add(Fault("late", from_command=place, commands=1, amount=0.22))
-                assert served.open(reply_s=0.1).describe() == found
+                assert served.open(reply_s=0.1).describe() == description
                 served.emulator.faults.clear()
                 served.lines.close()
 

@@ -57,5 +57,5 @@ class SerialPortConformance(DriverNoise):
                 process.communicate("\n")
             assert served.emulator.faults.commands == 0
             served.open()
-            with LineRegistry(clock=patient_clock()) as other, pytest.raises(PortBusy, match=rf"pid {os.getpid()}"):
-                open_axis("second", served.configs[0], other)
+            with LineRegistry(clock=patient_clock()) as registry, pytest.raises(PortBusy, match=rf"pid {os.getpid()}"):
+                open_axis("second", served.configs[0], registry)

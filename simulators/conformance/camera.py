@@ -232,10 +232,10 @@ class CameraConformance:
             return pixels
 
         twin.stop()
-        other = self.make_twin(flicker)
-        other.start()
+        flicker_twin = self.make_twin(flicker)
+        flicker_twin.start()
         try:
-            with self.open(other.entry) as camera:
+            with self.open(flicker_twin.entry) as camera:
                 camera.configure(CameraSettings(exposure_s=1e-3, frame_average=4))
                 exposure = camera.trigger()
                 exposure.wait_exposed()
@@ -244,19 +244,19 @@ class CameraConformance:
                 assert frame.pixels[1, 1] == 108  # the mean of 103, 106, 109, 112 is 107.5
                 assert frame.pixels[0, 0] == camera.full_scale
         finally:
-            other.stop()
+            flicker_twin.stop()
             twin.start()
 
     def test_every_frame_of_a_40_state_run_belongs_to_its_angle(self, scene: LightScene, camera: Camera) -> None:
         # The bench starts to move as soon as the exposure has ended, while the frame is still on its way.
-        seen = []
+        angles = []
         for state in range(40):
             scene.angle_deg = 9.0 * state
             exposure = camera.trigger()
             exposure.wait_exposed()
             scene.angle_deg = -1.0
-            seen.append(read_stamp(exposure.frame().pixels)[0])
-        assert seen == [9.0 * state for state in range(40)]
+            angles.append(read_stamp(exposure.frame().pixels)[0])
+        assert angles == [9.0 * state for state in range(40)]
 
     def test_a_frame_in_flight_when_a_setting_changes_is_thrown_away(self, scene: LightScene, camera: Camera) -> None:
         camera.configure(CameraSettings(exposure_s=0.1))

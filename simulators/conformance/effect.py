@@ -107,15 +107,15 @@ class ReflectanceEffectConformance:
 
     def test_it_does_nothing_at_zero_and_something_elsewhere(self, kind: str) -> None:
         effect: ReflectanceEffect = reflectance_effects()[kind]
-        there, index = random_geometry(300), 1.3 + 0.08j
+        geometry, index = random_geometry(300), 1.3 + 0.08j
         # With diffuse reflection, since registration acts through theta_h, which the first surface does not know.
         changes = ReflectanceChanges(diffuse_a=0.5)
-        plain = changes.dominant(there, index)
+        plain = changes.dominant(geometry, index)
         parameters = effect.parameters("")
         effect.bend(changes, "", np.zeros(len(parameters)))
-        assert changes.dominant(there, index) == pytest.approx(plain, abs=1e-12)
+        assert changes.dominant(geometry, index) == pytest.approx(plain, abs=1e-12)
         effect.bend(changes, "", np.array([p.typical for p in parameters]))
-        assert np.abs(changes.dominant(there, index) - plain).max() > 1e-3
+        assert np.abs(changes.dominant(geometry, index) - plain).max() > 1e-3
         require_bounds(parameters)
 
 

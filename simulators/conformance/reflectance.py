@@ -41,15 +41,15 @@ class ReflectanceConformance:
     def test_it_is_reciprocal(self, tmp_path: Path) -> None:
         # Each beam runs backwards: its x turns round, y stays.
         flip = np.diag([1.0, 1.0, -1.0, 1.0])
-        model, there = self.model(tmp_path), random_geometry(300)
-        forward = model.mueller_jones(there, self.wavelength_nm)
-        backward = model.mueller_jones(there.reversed(), self.wavelength_nm)
+        model, geometry = self.model(tmp_path), random_geometry(300)
+        forward = model.mueller_jones(geometry, self.wavelength_nm)
+        backward = model.mueller_jones(geometry.reversed(), self.wavelength_nm)
         np.testing.assert_allclose(backward, flip @ np.swapaxes(forward, -1, -2) @ flip, atol=1e-11)
 
     def test_jones_and_mueller_agree(self, tmp_path: Path) -> None:
-        model, there = self.model(tmp_path), random_geometry(50)
-        m = mueller.from_jones(model.jones(there, self.wavelength_nm))
-        np.testing.assert_allclose(model.mueller_jones(there, self.wavelength_nm), m / m[:, :1, :1], atol=1e-12)
+        model, geometry = self.model(tmp_path), random_geometry(50)
+        m = mueller.from_jones(model.jones(geometry, self.wavelength_nm))
+        np.testing.assert_allclose(model.mueller_jones(geometry, self.wavelength_nm), m / m[:, :1, :1], atol=1e-12)
 
 
 def random_geometry(count: int) -> ScatteringGeometry:

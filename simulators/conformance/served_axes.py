@@ -35,8 +35,8 @@ class ServedAxes:
         """Open an axis with short waits, as the emulator is fast."""
         config = self.configs[index]
         short = {"poll_s": 0.002, "margin_s": 0.3, "stall_s": 0.3, "reply_s": 0.25, "pause_before_move_s": 0.0}
-        known = {name: value for name, value in short.items() if name in type(config).model_fields}
-        entry = type(config).model_validate(config.model_dump() | known | changes)
+        waits = {name: value for name, value in short.items() if name in type(config).model_fields}
+        entry = type(config).model_validate(config.model_dump() | waits | changes)
         return open_axis(f"axis{index}", entry, self.lines)
 
 

@@ -31,8 +31,8 @@ class ServedSource:
 
     def open(self, reply_s: float = 0.2) -> LightSource:
         """Open it with a short wait for replies and choose the wavelength, where it has a choice."""
-        known = {"reply_s": reply_s} if "reply_s" in type(self.config).model_fields else {}
-        source = open_source(self.config.model_copy(update=known), self.lines)
+        waits = {"reply_s": reply_s} if "reply_s" in type(self.config).model_fields else {}
+        source = open_source(self.config.model_copy(update=waits), self.lines)
         if source.selects_wavelength:
             source.select(self.wavelength_nm)
         return source
@@ -102,12 +102,12 @@ class SourceConformance:
     @pytest.mark.parametrize("late_s", [0.16, 0.22])
     def test_one_late_answer_spoils_no_opening(self, served: ServedSource, late_s: float) -> None:
         """On a busy machine: one answer behind the wait for it, at every place of the opening."""
-        found = served.open().describe()
+        description = served.open().describe()
         commands = served.emulator.faults.commands
         served.lines.close()
         for place in range(1, commands + 1):
             served.emulator.faults.add(Fault("late", from_command=place, commands=1, amount=late_s))
-            assert served.open(reply_s=0.1).describe() == found
+            assert served.open(reply_s=0.1).describe() == description
             served.emulator.faults.clear()
             served.lines.close()
 

@@ -68,10 +68,10 @@ class DC2200Emulator(Emulator):
     def _led(self, part: str, led: int, rest: str) -> str | None:
         """Answer to a question, an empty text for a setting, None for what is not known."""
         words = rest.split()
-        known = {"STATE": "STAT", "MODE": "MODE", "CBRIGHTNESS:BRIGHTNESS": "LEVEL"}
+        setting_of = {"STATE": "STAT", "MODE": "MODE", "CBRIGHTNESS:BRIGHTNESS": "LEVEL"}
         # AMPLitude may be left out, or be cut to its capitals, as SCPI has it.
         header = re.sub(r":AMPL(ITUDE)?$", "", words[0].rstrip("?"))
-        name = known.get(re.sub(r":BRIG$", ":BRIGHTNESS", header).replace("CBR:", "CBRIGHTNESS:"))
+        name = setting_of.get(re.sub(r":BRIG$", ":BRIGHTNESS", header).replace("CBR:", "CBRIGHTNESS:"))
         if name is None or (name == "STAT") != (part == "OUTP"):
             return None
         if words[0].endswith("?"):

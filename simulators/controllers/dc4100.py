@@ -103,7 +103,7 @@ class DC4100Emulator(Emulator):
         if name == "e":
             error, self._error = self._error, (0, "no error")
             return f"ERROR {error[0]}:{error[1]}"
-        whole = {
+        box_values = {
             "n": self._model,
             "s": "M00223344",
             "v": "1.4.0",
@@ -112,11 +112,11 @@ class DC4100Emulator(Emulator):
             "sm": "0",
             "r": str(status),
         }
-        if name in whole and not arguments:
-            return whole[name]
+        if name in box_values and not arguments:
+            return box_values[name]
         channel = self._channel(arguments[0] if len(arguments) == 1 else "")
         if channel is not None and (nm := self.wavelengths_nm[channel]) is not None:
-            each = {
+            led_values = {
                 "wl": f"{nm:.1f}",
                 "o": str(int(self._on[channel])),
                 "bp": f"{self._percent[channel]:.1f}",
@@ -125,8 +125,8 @@ class DC4100Emulator(Emulator):
                 "ml": "1000",
                 "hs": f"HS{channel}",
             }
-            if name in each:
-                return each[name]
+            if name in led_values:
+                return led_values[name]
         self._error = _UNKNOWN if channel is None else _NO_LED
         return ""
 

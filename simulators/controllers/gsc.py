@@ -149,13 +149,13 @@ class GSCEmulator(Emulator):
 
     def _drive(self) -> bool:
         nexts, self._next = self._next, {}
-        for index, what in nexts.items():
+        for index, target in nexts.items():
             axis = self.axes[index]
-            if isinstance(what, str):
-                axis.run(axis.speed_deg_s / 10 * (1 if what == "+" else -1))
+            if isinstance(target, str):
+                axis.run(axis.speed_deg_s / 10 * (1 if target == "+" else -1))
             else:
                 low = -math.inf if axis.min_deg is None else axis.min_deg
-                axis.move_to(min(max(what, low), math.inf if axis.max_deg is None else axis.max_deg))
+                axis.move_to(min(max(target, low), math.inf if axis.max_deg is None else axis.max_deg))
         return bool(nexts)
 
     def _stop(self, which: str) -> bool:

@@ -63,9 +63,9 @@ class LCC25Emulator(Emulator):
         if not low <= float(setting[2]) <= high:
             return "Command error CMD_ARG_INVALID"
         self.values[setting[1]] = round(float(setting[2]), digits)
-        wanted = self.values[f"volt{max(1, int(self.values['mode']))}"] * self.values["enable"]
-        if wanted != self.axes[0].position_deg():
-            self.axes[0].move_to(wanted)
+        volts = self.values[f"volt{max(1, int(self.values['mode']))}"] * self.values["enable"]
+        if volts != self.axes[0].position_deg():
+            self.axes[0].move_to(volts)
         return ""
 
 

@@ -324,8 +324,8 @@ def axis_configs(emulator: SMC100Emulator, port: str) -> list[Config]:
     """Rig entries for every controller on the line."""
     entries = []
     for address, controller in emulator.controllers.items():
-        told = controller.axis.speed_deg_s if "AGP" in controller.version else None
-        entries.append(Config(port=port, address=address, speed_deg_s=told))
+        speed_deg_s = controller.axis.speed_deg_s if "AGP" in controller.version else None
+        entries.append(Config(port=port, address=address, speed_deg_s=speed_deg_s))
     return entries
 
 

@@ -266,14 +266,14 @@ class XPSConversation(Emulator):
             self._controller.gathering = Gathering([self._gathered(word) for word in words])
         elif name == "ConfigurationGet":
             names = {group.axis: group.name for group in self._controller.groups.values()}
-            return ";".join(f"{names[axis]}.Pos.{what}" for axis, what in gathering.types)
+            return ";".join(f"{names[axis]}.Pos.{quantity}" for axis, quantity in gathering.types)
         elif name == "Run":
             if not gathering.types:
                 raise XpsError(NOT_ALLOWED)
-            wanted, divisor = _numbers(words, 2)
-            if wanted < 1 or divisor < 1:
+            samples, divisor = _numbers(words, 2)
+            if samples < 1 or divisor < 1:
                 raise XpsError(OUT_OF_RANGE)
-            self._controller.gathering = Gathering(gathering.types, [], int(wanted), divisor * CYCLE_S, now_s)
+            self._controller.gathering = Gathering(gathering.types, [], int(samples), divisor * CYCLE_S, now_s)
         elif name in ("Stop", "StopAndSave"):
             gathering.wanted = len(gathering.samples)
         elif name == "Reset":
@@ -292,10 +292,10 @@ class XPSConversation(Emulator):
 
     def _gathered(self, word: str) -> tuple[EmulatedAxis, str]:
         """The axis of ``Group1.Pos.CurrentPosition`` and what is gathered of it."""
-        group, _, what = word.partition(".Pos.")
-        if group not in self._controller.groups or what not in ("CurrentPosition", "CurrentVelocity"):
+        group, _, quantity = word.partition(".Pos.")
+        if group not in self._controller.groups or quantity not in ("CurrentPosition", "CurrentVelocity"):
             raise XpsError(WRONG_FORMAT)
-        return self._controller.groups[group].axis, what
+        return self._controller.groups[group].axis, quantity
 
     def _set_compare(self, group: AxisGroup, words: list[str]) -> str:
         low_deg, high_deg, step_deg = _numbers(words, 3)

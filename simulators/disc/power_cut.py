@@ -29,9 +29,9 @@ def read_record(record: Path) -> Iterator[Call]:
     at = 0
     while at < len(raw):
         end = raw.index(b"\n", at)
-        what, path, offset, size = raw[at:end].decode().split("\t")
-        length = int(size) if what in ("write", "rename") else 0
-        yield Call(what, path, int(offset), raw[end + 1 : end + 1 + length])
+        kind, path, offset, size = raw[at:end].decode().split("\t")
+        length = int(size) if kind in ("write", "rename") else 0
+        yield Call(kind, path, int(offset), raw[end + 1 : end + 1 + length])
         at = end + 1 + length
 
 
@@ -77,16 +77,16 @@ class UnreliableDisc:
             file.waiting.clear()
             return
         # A folder: its names are safe from now on.
-        here = [change for change in self._waiting if str(Path(change[1] or change[0]).parent) == path]
-        self._waiting = [change for change in self._waiting if change not in here]
-        for change in here:
+        renames = [change for change in self._waiting if str(Path(change[1] or change[0]).parent) == path]
+        self._waiting = [change for change in self._waiting if change not in renames]
+        for change in renames:
             _rename(self._safe_names, change)
 
     def after_power_cut(self, chance: random.Random | None) -> dict[str, bytes]:
         """Content of every file there is after a power cut; without `chance` nothing that was not synced."""
         names = dict(self._safe_names)
-        kept = chance.randint(0, len(self._waiting)) if chance else 0
-        for change in self._waiting[:kept]:
+        count = chance.randint(0, len(self._waiting)) if chance else 0
+        for change in self._waiting[:count]:
             _rename(names, change)
         lost = [path for path, file in self._names.items() if file.folder and path not in names]
         return {

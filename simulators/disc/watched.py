@@ -20,11 +20,11 @@ def compiler() -> str | None:
 
 def build(folder: Path) -> Path:
     """Compile the library into a folder. Raises RuntimeError without a C compiler."""
-    found = compiler()
-    if found is None:
+    cc = compiler()
+    if cc is None:
         raise RuntimeError("there is no C compiler (cc or gcc): disc calls cannot be watched")
     library = folder / "disc_calls.so"
-    subprocess.run([found, "-O1", "-shared", "-fPIC", "-o", str(library), str(SOURCE), "-ldl", "-lpthread"], check=True)
+    subprocess.run([cc, "-O1", "-shared", "-fPIC", "-o", str(library), str(SOURCE), "-ldl", "-lpthread"], check=True)
     return library
 
 

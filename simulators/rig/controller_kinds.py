@@ -57,7 +57,7 @@ def served_kinds() -> dict[str, Callable[[ServeOptions], Emulator]]:
         kinds.update(getattr(module, "SERVES", {}))
     for plugin in entry_points(group="umov.emulators"):
         serves = plugin.load().SERVES
-        if taken := kinds.keys() & serves.keys():
-            raise ValueError(f"plug-in {plugin.value} serves {', '.join(sorted(taken))}, which exists already")
+        if duplicates := kinds.keys() & serves.keys():
+            raise ValueError(f"plug-in {plugin.value} serves {', '.join(sorted(duplicates))}, which exists already")
         kinds.update(serves)
     return dict(sorted(kinds.items()))

@@ -73,8 +73,8 @@ class SimulatedRig:
         port = self.config.ports[name]
         kinds = served_kinds()
         if port.kind not in kinds:
-            known = ", ".join(kinds)
-            raise ConfigError(f"simulator.ports.{name}: there is no emulator of kind {port.kind!r}, only {known}")
+            listing = ", ".join(kinds)
+            raise ConfigError(f"simulator.ports.{name}: there is no emulator of kind {port.kind!r}, only {listing}")
         options = ServeOptions(
             axes=port.axes,
             limits_deg=port.limits_deg,
@@ -129,8 +129,8 @@ class SimulatedRig:
     def port(self, name: str) -> str:
         """Device path of an emulated port. Raises ConfigError if there is none of that name."""
         if name not in self._ports:
-            known = ", ".join(sorted(self._ports))
-            raise ConfigError(f"port sim:{name}: `simulator.ports` has {known}")
+            listing = ", ".join(sorted(self._ports))
+            raise ConfigError(f"port sim:{name}: `simulator.ports` has {listing}")
         return self._ports[name].path
 
     def connect(self, axis: str, direction: int, zero_deg: float) -> None:
@@ -147,8 +147,8 @@ class SimulatedRig:
         With `omega_deg` the scene is computed for that arm angle now, instead of in the first exposure there.
         """
         if sample not in self.config.samples:
-            known = ", ".join(sorted(self.config.samples))
-            raise ConfigError(f"sample {sample!r}: the simulated rig has {known}")
+            listing = ", ".join(sorted(self.config.samples))
+            raise ConfigError(f"sample {sample!r}: the simulated rig has {listing}")
         scene = Scene.load(self.config.samples[sample])
         with self._lock:
             if self.bench is None:

@@ -44,10 +44,10 @@ class PtyPort(ServedPort):
         self._master = -1
 
     def _serve(self) -> None:
-        with patient_clock().attend() as here:
+        with patient_clock().attend() as check_in:
             pending = b""
             while True:
-                here()
+                check_in()
                 pending = (pending + self.emulator.take_output())[-65536:]
                 wait_s = self.emulator.next_output_s()
                 readable, _, _ = select.select(

@@ -109,9 +109,9 @@ class FaultSchedule:
             if fault.kind in ("not_homed", "slip"):
                 self._waiting.remove(fault)
             elif fault.commands is not None:
-                left = self._left.get(id(fault), fault.commands) - 1
-                self._left[id(fault)] = left
-                if left <= 0:
+                remaining = self._left.get(id(fault), fault.commands) - 1
+                self._left[id(fault)] = remaining
+                if remaining <= 0:
                     self._waiting.remove(fault)
         return self.active
 

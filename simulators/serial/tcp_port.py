@@ -32,11 +32,11 @@ class TcpPort(ServedPort):
     def _serve(self) -> None:
         talks: dict[socket.socket, SerialEmulator] = {}
         try:
-            with patient_clock().attend() as here, selectors.DefaultSelector() as selector:
+            with patient_clock().attend() as check_in, selectors.DefaultSelector() as selector:
                 selector.register(self._listener, selectors.EVENT_READ)
                 selector.register(self._wake_read, selectors.EVENT_READ)
                 while True:
-                    here()
+                    check_in()
                     waits = [wait for talk in talks.values() if (wait := talk.next_output_s()) is not None]
                     events = selector.select(max(0.0, min([*waits, BEAT_S])))
                     for key, _ in events:

@@ -62,9 +62,9 @@ class FeatureValues:
     def _require(self, names: Sequence[str]) -> None:
         name = self._first(names)
         if name is None:
-            there = next((name for name in names if name in self._nodes), names[0])
-            missing = "is not available" if there in self._nodes else "is missing, and a capture needs it"
-            raise self._nodes.error(there, missing)
+            feature = next((name for name in names if name in self._nodes), names[0])
+            missing = "is not available" if feature in self._nodes else "is missing, and a capture needs it"
+            raise self._nodes.error(feature, missing)
         with self._frame_start():
             end = self._nodes.end(name)
             if self._nodes.node(end).tag not in REGISTERS:
@@ -148,14 +148,14 @@ class FeatureValues:
     def events(self, moment: Moment) -> list[int]:
         """Numbers of the events of a moment that a host has asked for."""
         nodes, selector, switch = self._nodes, "EventSelector", "EventNotification"
-        asked = []
+        numbers = []
         for name in EVENTS[moment] if self._has(selector) and self._has(switch) else ():
             if name in nodes.entries(selector) and f"Event{name}" in nodes:
                 with nodes.assuming(selector, name):
                     # Makers have several words for on.
                     if nodes.chosen(switch) != "Off":
-                        asked.append(int(nodes.value(f"Event{name}")))
-        return asked
+                        numbers.append(int(nodes.value(f"Event{name}")))
+        return numbers
 
     def time_chunk(self, time_ns: int) -> dict[int, bytes] | None:
         """The chunk with the time of an exposure, by its number; empty if it is not enabled, None without chunks."""
@@ -184,15 +184,15 @@ class FeatureValues:
 
     def heard(self, address: int, count: int) -> list[str]:
         """Commands that were given by writing these bytes; their registers go back to zero."""
-        given = []
+        commands = []
         with self._frame_start():
-            for name, wanted in self._commands.items():
+            for name, code in self._commands.items():
                 end = self._nodes.end(name)
-                if self._nodes.register(end).overlaps(address, count) and self._nodes.value(end) == wanted:
-                    given.append(name)
-            for name in given:
+                if self._nodes.register(end).overlaps(address, count) and self._nodes.value(end) == code:
+                    commands.append(name)
+            for name in commands:
                 self._nodes.set_value(self._nodes.end(name), 0)
-        return given
+        return commands
 
     # --- what it tells -----------------------------------------------------------------------------------
 

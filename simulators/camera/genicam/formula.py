@@ -120,8 +120,8 @@ class Formula:
     def value(self, look_up: LookUp) -> Number:
         """Value with the variables that `look_up` knows by name. Raises FormulaError where it has none."""
         try:
-            found = self._term(look_up)
-            value = int(found) if self._whole else float(found)
+            result = self._term(look_up)
+            value = int(result) if self._whole else float(result)
             if not math.isfinite(value):
                 raise ValueError(f"it is {value}")
             return value
@@ -130,13 +130,13 @@ class Formula:
 
     @staticmethod
     def _split(text: str) -> list[str]:
-        tokens, at, text = [], 0, text.strip()
-        while at < len(text):
-            found = _TOKEN.match(text, at)
-            if found is None:
-                raise FormulaError(f"cannot be read from {text[at : at + 20]!r} on")
-            tokens.append(found[1])
-            at = found.end()
+        tokens, position, text = [], 0, text.strip()
+        while position < len(text):
+            match = _TOKEN.match(text, position)
+            if match is None:
+                raise FormulaError(f"cannot be read from {text[position : position + 20]!r} on")
+            tokens.append(match[1])
+            position = match.end()
         return tokens
 
     def _next(self) -> str:

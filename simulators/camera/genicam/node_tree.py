@@ -134,39 +134,39 @@ class NodeTree:
 
     def limit(self, name: str, which: Limit) -> Number | None:
         """Smallest or largest value, or step, as a program sees it; None where no node says."""
-        for here in self._way_down(name):
-            node = self.node(here)
-            other = node.findtext(f"p{which}")
-            if other is not None:
-                return self.value(other)
+        for source in self._way_down(name):
+            node = self.node(source)
+            reference = node.findtext(f"p{which}")
+            if reference is not None:
+                return self.value(reference)
             if node.find(which) is not None:
-                return self._number(here, node.findtext(which))
+                return self._number(source, node.findtext(which))
             if node.tag in _CONVERTERS:
                 return None
         if node.tag in REGISTERS and which != "Inc":
-            return self.register(here).limits[which == "Max"]
+            return self.register(source).limits[which == "Max"]
         return None
 
     def limit_node(self, name: str, which: Limit) -> str | None:
         """The node that gives a limit of a feature; None where it is written down or not said."""
-        found = (self.node(here).findtext(f"p{which}") for here in self._way_down(name))
-        return next((other for other in found if other is not None), None)
+        references = (self.node(source).findtext(f"p{which}") for source in self._way_down(name))
+        return next((reference for reference in references if reference is not None), None)
 
     def _way_down(self, name: str) -> Iterator[str]:
         """A node, and those that its value comes from, one after another."""
-        here: str | None = name
+        current: str | None = name
         for _ in range(_LONGEST_WAY):
-            if here is None:
+            if current is None:
                 return
-            yield here
-            here = self._target(here)
+            yield current
+            current = self._target(current)
         raise self.error(name, "refers to itself")
 
     def command_value(self, name: str) -> Number:
         """What a program writes to give a command."""
         node = self.node(name)
-        other = node.findtext("pCommandValue")
-        return self.value(other) if other is not None else self._number(name, node.findtext("CommandValue"))
+        reference = node.findtext("pCommandValue")
+        return self.value(reference) if reference is not None else self._number(name, node.findtext("CommandValue"))
 
     # --- enumerations ------------------------------------------------------------------------------------
 
@@ -180,8 +180,8 @@ class NodeTree:
 
     def is_true(self, node: Element, condition: str, otherwise: bool = True) -> bool:
         """Value of a condition of a node such as pIsImplemented."""
-        other = node.findtext(condition)
-        return otherwise if other is None else bool(self.value(other))
+        reference = node.findtext(condition)
+        return otherwise if reference is None else bool(self.value(reference))
 
     def chosen(self, name: str) -> str:
         """Name of the entry that an Enumeration has now. Raises NodeError if its value is none of them."""
@@ -245,23 +245,23 @@ class NodeTree:
 
     def inputs(self, name: str) -> set[str]:
         """All register nodes that a value depends on."""
-        found: set[str] = set()
+        registers: set[str] = set()
         waiting = [name]
-        seen: set[str] = set()
+        visited: set[str] = set()
         while waiting:
-            here = waiting.pop()
-            if here in seen or here not in self._nodes:
+            current = waiting.pop()
+            if current in visited or current not in self._nodes:
                 continue
-            seen.add(here)
-            node = self._nodes[here]
+            visited.add(current)
+            node = self._nodes[current]
             if node.tag in REGISTERS:
-                found.add(here)
+                registers.add(current)
             waiting += [
                 child.text or ""
                 for child in node
                 if child.tag in ("pVariable", "pIndex") or child.tag.startswith("pValue")
             ]
-        return found
+        return registers
 
     def is_the_cameras_own(self, name: str) -> bool:
         """True for a register that programs can only read."""

@@ -66,9 +66,9 @@ def power_up(nodes: NodeTree, sensor: tuple[int, int], texts: dict[str, str]) ->
             nodes.set_text(name, text)
     follow(nodes, sensor)
     for name, key, full in zip(("Width", "Height"), ("columns", "rows"), sensor, strict=True):
-        for whole in (f"Sensor{name}", f"{name}Max"):
-            if whole in nodes:
-                _require_size(nodes, whole, nodes.value(whole), key, full=full)
+        for maximum in (f"Sensor{name}", f"{name}Max"):
+            if maximum in nodes:
+                _require_size(nodes, maximum, nodes.value(maximum), key, full=full)
         _require_size(nodes, name, nodes.limit(name, "Max"), key, full=full)
         nodes.set_value(name, full)
     _set_light(nodes)
@@ -80,19 +80,19 @@ def power_up(nodes: NodeTree, sensor: tuple[int, int], texts: dict[str, str]) ->
 
 def follow(nodes: NodeTree, sensor: tuple[int, int]) -> None:
     """Bring the limits of the region and the size of a frame up to date, where the camera keeps them in registers."""
-    for size, offset, whole, both, full in (
+    for size, offset, sensor_size, direction, full in (
         ("Width", "OffsetX", "SensorWidth", "Horizontal", sensor[0]),
         ("Height", "OffsetY", "SensorHeight", "Vertical", sensor[1]),
     ):
-        sent = full // int(_optional(nodes, f"Binning{both}") * _optional(nodes, f"Decimation{both}"))
-        told: set[str] = set()
-        for name, value in ((whole, full), (f"{size}Max", sent), (nodes.limit_node(size, "Max"), sent)):
+        sent = full // int(_optional(nodes, f"Binning{direction}") * _optional(nodes, f"Decimation{direction}"))
+        registers: set[str] = set()
+        for name, value in ((sensor_size, full), (f"{size}Max", sent), (nodes.limit_node(size, "Max"), sent)):
             if name is not None and name in nodes:
                 tell(nodes, name, value)
-                told |= nodes.inputs(name)
+                registers |= nodes.inputs(name)
         top = nodes.limit_node(offset, "Max") if offset in nodes else None
         # On some cameras an offset may be anywhere on the sensor, whatever the width.
-        if top is not None and not told & nodes.inputs(top):
+        if top is not None and not registers & nodes.inputs(top):
             tell(nodes, top, max(0, sent - int(nodes.value(size))))
 
 
@@ -120,9 +120,9 @@ def tell_flag(nodes: NodeTree, name: str, value: int) -> bool:
 def _make(nodes: NodeTree, name: str, good: Callable[[Number], bool], candidates: Sequence[Number]) -> bool:
     if good(nodes.value(name)):
         return True
-    own = [register for register in sorted(nodes.inputs(name)) if nodes.is_the_cameras_own(register)]
+    adjustable = [register for register in sorted(nodes.inputs(name)) if nodes.is_the_cameras_own(register)]
     # One after another, and all of them together for a formula that wants several.
-    for registers in (*([register] for register in own), own):
+    for registers in (*([register] for register in adjustable), adjustable):
         before = {register: nodes.value(register) for register in registers}
         for candidate in candidates:
             for register in registers:
@@ -172,9 +172,9 @@ def _revive(nodes: NodeTree, name: str) -> None:
 def _unhide(nodes: NodeTree, name: str) -> None:
     for node in (nodes.node(name), *nodes.node(name).iter("EnumEntry")):
         for condition, wanted in (("pIsImplemented", True), ("pIsAvailable", True), ("pIsLocked", False)):
-            other = node.findtext(condition)
-            if other is not None:
-                _make(nodes, other, lambda now, wanted=wanted: bool(now) == wanted, (_ALL_ONES, 1, 0))  # type: ignore[misc]
+            reference = node.findtext(condition)
+            if reference is not None:
+                _make(nodes, reference, lambda now, wanted=wanted: bool(now) == wanted, (_ALL_ONES, 1, 0))  # type: ignore[misc]
 
 
 def _open_limits(nodes: NodeTree, name: str) -> None:
@@ -216,8 +216,8 @@ def _set_light(nodes: NodeTree) -> None:
 
 
 def _first_format(nodes: NodeTree) -> str:
-    known = {fmt.name for fmt in PIXEL_FORMATS}
-    offered = [name for name in nodes.entries("PixelFormat") if name in known]
+    formats = {fmt.name for fmt in PIXEL_FORMATS}
+    offered = [name for name in nodes.entries("PixelFormat") if name in formats]
     if not offered:
         raise nodes.error(
             "PixelFormat", f"has no format that is known here, but {', '.join(nodes.entries('PixelFormat'))}"

@@ -36,15 +36,15 @@ class RegisterMemory:
 
     def copy(self) -> "RegisterMemory":
         """The same bytes, apart from these."""
-        other = RegisterMemory()
-        other._pages = {page: bytearray(content) for page, content in self._pages.items()}
-        return other
+        duplicate = RegisterMemory()
+        duplicate._pages = {page: bytearray(content) for page, content in self._pages.items()}
+        return duplicate
 
     def restore(self, other: "RegisterMemory", but: Iterable[tuple[int, int]] = ()) -> None:
         """Take the bytes of another memory, except from each first address to before the last one of `but`."""
-        kept = [(first, self.read(first, last - first)) for first, last in but]
+        pieces = [(first, self.read(first, last - first)) for first, last in but]
         self._pages = other.copy()._pages
-        for first, data in kept:
+        for first, data in pieces:
             self.write(first, data)
 
 
@@ -102,11 +102,11 @@ class Register:
             memory.write(self.address, struct.pack(self._format, value))
             return
         mask = (1 << self._width) - 1
-        whole = round(value) & mask
+        word = round(value) & mask
         if self.bits is not None:
-            others = int.from_bytes(memory.read(self.address, self.length), self._order)
-            whole = others & ~(mask << self.bits[0]) | whole << self.bits[0]
-        memory.write(self.address, whole.to_bytes(self.length, self._order))
+            old_word = int.from_bytes(memory.read(self.address, self.length), self._order)
+            word = old_word & ~(mask << self.bits[0]) | word << self.bits[0]
+        memory.write(self.address, word.to_bytes(self.length, self._order))
 
     def set_text(self, memory: RegisterMemory, text: str) -> None:
         """Write a text, cut to the length."""
