@@ -32,12 +32,12 @@ FACTORS = (0.5, 2.0)
 
 def numbers() -> dict[str, str]:
     """Names of the numbers, each with its module."""
-    found = {}
+    module_of = {}
     for module in MODULES:
         for name, value in vars(importlib.import_module(module)).items():
             if name.isupper() and isinstance(value, int | float | np.ndarray) and not isinstance(value, bool):
-                found[name] = module
-    return found
+                module_of[name] = module
+    return module_of
 
 
 def change(name: str, factor: float) -> None:

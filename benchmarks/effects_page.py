@@ -70,17 +70,17 @@ class Described:
     @classmethod
     def of(cls, kind: str, module: str) -> "Described":
         """Read the sections of a module's docstring."""
-        title, _, rest = module.partition("\n\n")
-        _, _, rest = rest.partition("Cause:")
-        cause, _, remedy = rest.partition("Mend:")
+        title, _, body = module.partition("\n\n")
+        _, _, body = body.partition("Cause:")
+        cause, _, remedy = body.partition("Mend:")
         return cls(kind, *(" ".join(text.split()) for text in (title, cause, remedy)))
 
     def lines(self, before: "Sequence[Described]") -> str:
         """Heading, title, cause and remedy; a reference where an effect `before` has the same."""
         head = f"\n### {self.kind}\n\n{wrapped(self.title)}\n\n"
-        for other in before:
-            if (other.cause, other.remedy) == (self.cause, self.remedy):
-                return f"{head}Cause and remedy are those of [{other.kind}](#{other.kind}).\n"
+        for earlier in before:
+            if (earlier.cause, earlier.remedy) == (self.cause, self.remedy):
+                return f"{head}Cause and remedy are those of [{earlier.kind}](#{earlier.kind}).\n"
         return f"{head}{wrapped(f'**Cause:** {self.cause}')}\n\n{wrapped(f'**Remedy:** {self.remedy}')}\n"
 
 
@@ -159,28 +159,28 @@ def residual(effect: BenchEffect, scene: SceneImage, omega_deg: float) -> NDArra
     )
     frames = []
     for k in range(len(table)):
-        here = {axis: float(values[k]) for axis, values in angles.items()}
-        electrons = bench.expected_electrons(here, EXPOSURE_S, k, omega_deg=omega_deg)
-        frames.append(effect.detector(electrons, Shot(k, EXPOSURE_S, k * PERIOD_S, bench.seed, here)))
+        pose = {axis: float(values[k]) for axis, values in angles.items()}
+        electrons = bench.expected_electrons(pose, EXPOSURE_S, k, omega_deg=omega_deg)
+        frames.append(effect.detector(electrons, Shot(k, EXPOSURE_S, k * PERIOD_S, bench.seed, pose)))
     y = np.stack(frames).astype(float).reshape(len(frames), -1)
     w = model.at(WAVELENGTH_NM).rows(angles).reshape(len(frames), 16)
     columns = w if omega_deg != 180 else (w @ np.eye(4).reshape(16))[:, None]
-    left = y - columns @ (np.linalg.pinv(columns) @ y)
+    residuals = y - columns @ (np.linalg.pinv(columns) @ y)
     bright = y.mean(axis=0) > 0.1 * y.mean()
-    return np.asarray(np.where(bright, left / y[:, bright].mean(), 0.0).reshape(-1, SIDE, SIDE))
+    return np.asarray(np.where(bright, residuals / y[:, bright].mean(), 0.0).reshape(-1, SIDE, SIDE))
 
 
 def picture(fault: TypicalFault) -> Figure:
     """Mean residual of each state on the left, rms over the states of each pixel on the right."""
     effect = fault.example()
-    left = {
+    residuals = {
         name: 100 * residual(effect, Scene.load(CONFIGS / f"scenes/{file}.yaml"), omega_deg)
         for name, file, omega_deg in (("sphere", "red_sphere", 35.0), ("air", "air", 180.0))
     }
     figure = Figure(figsize=(7, 1.7), layout="constrained", facecolor="white")
     states, *maps = figure.subplots(1, 3, width_ratios=[2.6, 1, 1])
-    end = max(float(np.sqrt((r**2).mean(axis=0)).max()) for r in left.values()) or 1.0
-    for axis, (name, r), colour in zip(maps, left.items(), ("#b2182b", "#2166ac"), strict=True):
+    end = max(float(np.sqrt((r**2).mean(axis=0)).max()) for r in residuals.values()) or 1.0
+    for axis, (name, r), colour in zip(maps, residuals.items(), ("#b2182b", "#2166ac"), strict=True):
         lit = np.abs(r).max(axis=0) > 0
         means = r[:, lit].mean(axis=1) if lit.any() else np.zeros(len(r))
         states.plot(means, "o-", ms=2, lw=0.8, color=colour, label=name)

@@ -24,10 +24,10 @@ BOUNDS = tuple(
 
 def fall_of(components: float) -> float:
     """Factor from one variance of an instrument's noise to the next, in 15 directions, for `COMPONENTS` of a block."""
-    wanted, steps = 1 / (1 / 15 + 16 / 15 * (1 / components - 1 / 8)), np.arange(15)
-    if wanted > 14.999:
+    target, steps = 1 / (1 / 15 + 16 / 15 * (1 / components - 1 / 8)), np.arange(15)
+    if target > 14.999:
         return 1.0
-    return float(optimize.brentq(lambda r: np.sum(r**steps) ** 2 / np.sum(r ** (2 * steps)) - wanted, 1e-3, 1))
+    return float(optimize.brentq(lambda r: np.sum(r**steps) ** 2 / np.sum(r ** (2 * steps)) - target, 1e-3, 1))
 
 
 def blocks(components: float, random: np.random.Generator, draws: int = DRAWS) -> np.ndarray:
@@ -56,11 +56,11 @@ def eigenvalues(
     The noise `into` (draws, 8, 15) has variance 1 of an element on average over its directions.
     """
     noise = np.einsum("dai,di,ajk->djk", into, random.normal(size=into.shape[::2]), basis(), optimize=True)
-    found, vectors = np.linalg.eigh(noise + np.diag([first + second, second, 0.0]))
-    found, vectors = found[:, ::-1], vectors[:, :, ::-1]
+    values, vectors = np.linalg.eigh(noise + np.diag([first + second, second, 0.0]))
+    values, vectors = values[:, ::-1], vectors[:, :, ::-1]
     slopes = np.einsum("djk,ajl,dlk->dka", vectors.conj(), basis(), vectors, optimize=True).real
-    own = np.sqrt(1.5 * np.square(slopes @ into).sum(axis=-1))
-    return found - found.mean(axis=1, keepdims=True), np.maximum(own, LEAST_OWN)
+    errors = np.sqrt(1.5 * np.square(slopes @ into).sum(axis=-1))
+    return values - values.mean(axis=1, keepdims=True), np.maximum(errors, LEAST_OWN)
 
 
 def deviations(first: float, second: float) -> np.ndarray:
@@ -88,9 +88,9 @@ def bound(
     penalty, shift = smooth * rough.T @ rough, np.full(nodes**2, deviate)
     for _ in range(ROUNDS):
         misses, slopes = [], []
-        for gaps, (seen, own, plain) in drawn.items():
-            between = own[:, k : k + 1] * plain
-            z = (seen[:, k] + between @ shift - deviations(*gaps)[k]) / np.sqrt(OF_MEAN)
+        for gaps, (observed, errors, plain) in drawn.items():
+            between = errors[:, k : k + 1] * plain
+            z = (observed[:, k] + between @ shift - deviations(*gaps)[k]) / np.sqrt(OF_MEAN)
             misses.append(ndtr(z).mean() - level)
             slopes.append(np.exp(-(z**2) / 2) @ between / len(z) / np.sqrt(2 * np.pi * OF_MEAN))
         slope = np.array(slopes)
@@ -105,8 +105,8 @@ if __name__ == "__main__":
     for components in COMPONENTS:
         into, drawn = blocks(components, random), {}
         for gaps in itertools.product(TRUE, TRUE):
-            seen, own = eigenvalues(*gaps, random, into)
-            drawn[gaps] = seen, own, weights(seen)
+            observed, errors = eigenvalues(*gaps, random, into)
+            drawn[gaps] = observed, errors, weights(observed)
         shifts.append([bound(*each, drawn) for each in BOUNDS])
         print(components)
     np.savez_compressed(TABLE, shifts=np.array(shifts, dtype=np.float32))

@@ -97,19 +97,19 @@ def cells_of(
     ((name_of_w, w),) = instrument.items()
     stack = np.stack(list(matrices.values()))
     truth = _planes(noisy_image(stack, BRIGHT, 0, w), extra)
-    found = _planes(noisy_image(np.repeat(stack, pixels, axis=0), electrons, seed, w, darks=darks), extra)
+    planes = _planes(noisy_image(np.repeat(stack, pixels, axis=0), electrons, seed, w, darks=darks), extra)
     length_of = {angle: length for length, angles in ANGLES_OF.items() for angle in angles}
     for k, sample in enumerate(matrices):
         mine = slice(k * pixels, (k + 1) * pixels)
-        for name in found:
-            if f"{name}_errors" not in found:
+        for name in planes:
+            if f"{name}_errors" not in planes:
                 continue
-            value, error = (found[n][..., mine].astype(float) for n in (name, f"{name}_errors"))
+            value, error = (planes[n][..., mine].astype(float) for n in (name, f"{name}_errors"))
             true, true_error = (truth[n][..., k : k + 1].astype(float) for n in (name, f"{name}_errors"))
             if name == "mueller":
                 true = stack[k].reshape(4, 4, 1, 1) * electrons / w[:, 0].mean()
                 true_error = 1e-6 * np.ones_like(true)
-            bounds = found.get(f"{name}_95")
+            bounds = planes.get(f"{name}_95")
             least, most = whole_range(name, value)
             if bounds is None:
                 low, high = value - NORMAL_95 * error, value + NORMAL_95 * error
@@ -128,14 +128,14 @@ def cells_of(
             exists = np.broadcast_to(exists & (np.nan_to_num(error).max(axis=-1, keepdims=True) > FIXED), value.shape)
             if not exists.any():
                 continue
-            known = exists & np.isfinite(error) & np.isfinite(value)
+            is_finite = exists & np.isfinite(error) & np.isfinite(value)
             tolerance = ROUNDING + 3 * true_error
             with np.errstate(invalid="ignore", divide="ignore"):
-                pull = (off / error)[known]
+                pull = (off / error)[is_finite]
                 inside_95 = ((off <= value - low + tolerance) & (off >= value - high - tolerance))[exists]
                 inside_68 = (np.abs(off) <= error + tolerance)[exists]
-                if f"{name}_68" in found:
-                    bounds = found[f"{name}_68"][..., mine]
+                if f"{name}_68" in planes:
+                    bounds = planes[f"{name}_68"][..., mine]
                     inside_68 = ((bounds[0] <= true + tolerance) & (true - tolerance <= bounds[1]))[exists]
             # Where there is no value the interval is everything.
             unknown = (~np.isfinite(value) & (low <= true + tolerance) & (true - tolerance <= high))[exists]
@@ -159,9 +159,9 @@ def cells_of(
 
 
 def _planes(image: object, extra: Sequence[str]) -> dict[str, np.ndarray]:
-    found = quantities_block(image, tuple(extra), PAPER_PAIRS)  # type: ignore[arg-type]
+    planes = quantities_block(image, tuple(extra), PAPER_PAIRS)  # type: ignore[arg-type]
     xi0 = eigenvalue_block(image)  # type: ignore[arg-type]
-    return found | {
+    return planes | {
         "mueller": image.values,  # type: ignore[attr-defined]
         "mueller_errors": image.errors,  # type: ignore[attr-defined]
         "process xi0": xi0["xi0"],
@@ -197,9 +197,9 @@ def table_of_everything(found: Sequence[Cell]) -> str:
             # The others cover no more than they claim, or are too few to tell.
             by_range = [c for c in above if not c.in_95_others > MOST_95 or c.everything > 1 - FEW]
             weights = np.array([1 - c.everything for c in some])
-            others = np.array([c.in_95_others for c in some])[weights > 0] @ weights[weights > 0]
+            weighted = np.array([c.in_95_others for c in some])[weights > 0] @ weights[weights > 0]
             share = 100 * np.mean([c.everything for c in some]) if some else 0
-            covered = f"{100 * others / weights.sum():.1f}" if weights.sum() > 0 else "-"
+            covered = f"{100 * weighted / weights.sum():.1f}" if weights.sum() > 0 else "-"
             lines.append(f"| {name} | {electrons:g} | {len(above)} | {len(by_range)} | {share:.0f} | {covered} |")
     return "\n".join(lines) + "\n"
 

@@ -84,7 +84,7 @@ def emulated(
         random=random,
         wrong=fault(bench, np.random.default_rng(seed)) if fault else None,
     )
-    other = emulated_capture(true, bench, SAMPLE, "unknown", file=file, random=random)
+    sample = emulated_capture(true, bench, SAMPLE, "unknown", file=file, random=random)
 
     def truth(product: dict[str, Array]) -> Array:
         if "stokes" not in product:
@@ -92,7 +92,7 @@ def emulated(
         sent = SAMPLE @ true.generator_states({})[0]
         return np.asarray(sent / sent[0])
 
-    return chain(name, air, other, file, truth=truth, reference="the emulated sample")
+    return chain(name, air, sample, file, truth=truth, reference="the emulated sample")
 
 
 def chain(
@@ -100,10 +100,10 @@ def chain(
 ) -> Row:
     """Diagnose a capture, write, and reduce another with both files."""
     model = InstrumentModel.load(file)
-    found = diagnose_captures([air], model)[0].diagnosis
+    diagnosis = diagnose_captures([air], model)[0].diagnosis
     new = file.with_name(f"{file.stem}.new.yaml")
     try:
-        write_instrument(new, model, found)
+        write_instrument(new, model, diagnosis)
     except WriteError:
         new = file
     train = file.with_name(f"{file.stem}.train.yaml")
@@ -112,11 +112,11 @@ def chain(
     for k, used in enumerate((file, train, new)):
         product = means_of(Reduction(other, used).make(other.with_suffix(f".{k}.h5"), True))
         values, stated = relative(product)
-        wanted = truth(product).reshape(values.shape)
-        seen = np.isfinite(values) & (np.arange(values.size) > 0)
-        errors.append((_rms(values[seen] - wanted[seen]), _rms(stated[seen])))
+        expected = truth(product).reshape(values.shape)
+        valid = np.isfinite(values) & (np.arange(values.size) > 0)
+        errors.append((_rms(values[valid] - expected[valid]), _rms(stated[valid])))
     (nominal, _), (alone, _), (written, stated) = errors
-    return Row(name, nominal, alone, written, stated, found.verdict, reference)
+    return Row(name, nominal, alone, written, stated, diagnosis.verdict, reference)
 
 
 def half_wave_plate(nm: int, files: Mapping[str, Path], folder: Path, draw: int = 0) -> Row:
@@ -138,8 +138,8 @@ def half_wave_plate(nm: int, files: Mapping[str, Path], folder: Path, draw: int 
         return min((reference, flip @ reference @ flip), key=lambda one: _rms(one - m))
 
     if draw:
-        kept = sorted(np.random.default_rng(draw).choice(len(air.rows), len(air.rows) - 10, replace=False))
-        air = replace(air, rows=tuple(f"{n},{air.rows[k].partition(',')[2]}" for n, k in enumerate(kept)))
+        indices = sorted(np.random.default_rng(draw).choice(len(air.rows), len(air.rows) - 10, replace=False))
+        air = replace(air, rows=tuple(f"{n},{air.rows[k].partition(',')[2]}" for n, k in enumerate(indices)))
     return _measured("drr_wollaston", (air, plate), folder, truth, reference="the ratio of the channels")
 
 
@@ -185,8 +185,8 @@ def means_of(path: Path) -> dict[str, Array]:
     with Product(path) as product:
         names = {"mueller", "mueller_errors", "mueller_systematic", "s0", "s1", "s2", "s1_errors", "s2_errors"}
         names |= {"stokes", "stokes_errors", "stokes_systematic", "s1_systematic", "s2_systematic"}
-        found = {name: np.asarray(product.get(name), dtype=float) for name in names & set(product.names)}
-    return {name: values.mean(axis=(-2, -1)) for name, values in found.items()}
+        planes = {name: np.asarray(product.get(name), dtype=float) for name in names & set(product.names)}
+    return {name: values.mean(axis=(-2, -1)) for name, values in planes.items()}
 
 
 def relative(product: dict[str, Array]) -> tuple[Array, Array]:

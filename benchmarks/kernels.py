@@ -38,8 +38,8 @@ def main() -> None:
     failed = []
     for name, variables in environments().items():
         child = os.environ | {"OPENBLAS_NUM_THREADS": "1"} | variables
-        taken = subprocess.run([sys.executable, "-c", ARCHITECTURE], env=child, capture_output=True, text=True)
-        print(f"kernels: {name}, OpenBLAS runs {taken.stdout.strip()}", flush=True)
+        result = subprocess.run([sys.executable, "-c", ARCHITECTURE], env=child, capture_output=True, text=True)
+        print(f"kernels: {name}, OpenBLAS runs {result.stdout.strip()}", flush=True)
         options = sys.argv[1:] or [*TESTS, "-n", "2"]
         if subprocess.run([sys.executable, "-m", "pytest", "-q", *options], env=child, cwd=ROOT).returncode:
             failed.append(name)

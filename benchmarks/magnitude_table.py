@@ -25,9 +25,9 @@ def distribution(components: float, along: float) -> np.ndarray:
     """
     mean, variance = components - along, 2 * (components - along**2)
     across = gammaincinv(mean**2 / variance, _QUANTILES) * variance / mean
-    rest = np.sqrt(np.maximum(_R[:, None] ** 2 - across, 0)) / np.sqrt(along)
+    length = np.sqrt(np.maximum(_R[:, None] ** 2 - across, 0)) / np.sqrt(along)
     size = _THETA / np.sqrt(along)
-    return np.array([(ndtr(rest - theta) - ndtr(-rest - theta)) @ _WEIGHTS for theta in size])
+    return np.array([(ndtr(length - theta) - ndtr(-length - theta)) @ _WEIGHTS for theta in size])
 
 
 def acceptance(cumulative: np.ndarray, level: float) -> np.ndarray:
@@ -39,8 +39,8 @@ def acceptance(cumulative: np.ndarray, level: float) -> np.ndarray:
     out = np.empty((len(_THETA), 2))
     for row, mine, each, upto in zip(out, density, ratio, cumulative, strict=True):
         order = np.argsort(-each, kind="stable")
-        taken = order[: np.searchsorted(np.cumsum(mine[order]), level) + 1]
-        first = taken.min()
+        accepted = order[: np.searchsorted(np.cumsum(mine[order]), level) + 1]
+        first = accepted.min()
         row[:] = (_R[first] if first else 0.0), np.interp(upto[first] + level, upto, _R)
     return np.asarray(np.maximum.accumulate(out, axis=0))
 
@@ -67,13 +67,13 @@ def sums() -> np.ndarray:
     """Lower and upper bound at 68 and 95 % (4, observed) of the sum of three equal singular values."""
     noise = np.random.default_rng(2026).normal(size=(100_000, 3, 3))
     theta = np.concatenate([np.arange(0, 8, 0.5), np.arange(8, 31, 1.0)])
-    seen = [np.linalg.svd(noise + t / 3 * np.eye(3), compute_uv=False).sum(axis=1) for t in theta]
+    samples = [np.linalg.svd(noise + t / 3 * np.eye(3), compute_uv=False).sum(axis=1) for t in theta]
     out = []
     for level in LEVELS:
         # From an upper limit at zero to two sides, where the sum stands out.
         below = (1 - level) / 2 * (1 - np.exp(-(theta**2) / 8))
-        low = [np.quantile(each, p) if p else 0.0 for each, p in zip(seen, below, strict=True)]
-        high = [np.quantile(each, p + level) for each, p in zip(seen, below, strict=True)]
+        low = [np.quantile(each, p) if p else 0.0 for each, p in zip(samples, below, strict=True)]
+        high = [np.quantile(each, p + level) for each, p in zip(samples, below, strict=True)]
         out += [_lower(SUMS, np.asarray(high), theta), np.interp(SUMS, low, theta)]
     return np.array(out)
 

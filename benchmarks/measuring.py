@@ -59,9 +59,9 @@ def seconds(work: Callable[[], object]) -> float:
 def spent(work: Callable[[], object]) -> Spent:
     """What one call cost; what it says itself if it says so."""
     wall, processor = time.perf_counter(), time.process_time()
-    said = work()
-    if isinstance(said, Spent):
-        return said
+    result = work()
+    if isinstance(result, Spent):
+        return result
     return Spent(time.perf_counter() - wall, time.process_time() - processor)
 
 
@@ -102,12 +102,12 @@ def measure(task: Task, repeats: int, console: Console, busy: bool) -> bool:
     rounds = min(repeats, task.rounds or repeats)
     if task.rounds is None:
         task.ours()  # compiles, and touches the memory
-    own: list[Spent] = []
+    costs: list[Spent] = []
     ratios: dict[str, list[float]] = {name: [] for name in task.peers}
     times: dict[str, list[float]] = {name: [] for name in task.peers}
     silent: dict[str, str] = {}
     for k in range(rounds):
-        own.append(spent(task.ours))
+        costs.append(spent(task.ours))
         for name, run in task.peers.items():
             if name in silent or (k >= SLOW_ROUNDS and times[name] and times[name][-1] > 1):
                 continue
@@ -116,8 +116,8 @@ def measure(task: Task, repeats: int, console: Console, busy: bool) -> bool:
             except RuntimeError as error:
                 silent[name] = str(error)
                 continue
-            ratios[name].append(times[name][-1] / own[-1].wall_s)
-    walls, cores = [1000 * s.wall_s for s in own], [1000 * s.processor_s / thread_count() for s in own]
+            ratios[name].append(times[name][-1] / costs[-1].wall_s)
+    walls, cores = [1000 * s.wall_s for s in costs], [1000 * s.processor_s / thread_count() for s in costs]
     ours, core = float(np.median(walls)), float(np.median(cores))
     lines = [f"{task.name}: {ours:.1f} ms (best {min(walls):.1f}, processor time of a core {core:.1f})"]
     met = True

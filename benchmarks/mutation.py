@@ -32,12 +32,12 @@ def run(minutes: float, names: list[str]) -> None:
 
 def outcomes() -> dict[str, dict[str, str]]:
     """For each file, what became of each of its changes, as far as they were tried."""
-    found = {}
+    statuses = {}
     for path in sorted((ROOT / "mutants").rglob("*.py.meta")):
         codes = json.loads(path.read_text())["exit_code_by_key"]
         name = str(path.relative_to(ROOT / "mutants")).removesuffix(".meta")
-        found[name] = {mutant: status_by_exit_code[code] for mutant, code in codes.items()}
-    return {name: found[name] for name in found if found[name]}
+        statuses[name] = {mutant: status_by_exit_code[code] for mutant, code in codes.items()}
+    return {name: statuses[name] for name in statuses if statuses[name]}
 
 
 def main() -> None:
@@ -50,13 +50,13 @@ def main() -> None:
     if not options.survivors:
         run(options.minutes, options.names)
     print(f"{'file':48} {'changes':>7} {'tried':>6} {'noticed':>7}  score")
-    for name, found in outcomes().items():
-        tried = Counter(status for status in found.values() if status not in ("not checked", "skipped"))
+    for name, statuses in outcomes().items():
+        tried = Counter(status for status in statuses.values() if status not in ("not checked", "skipped"))
         noticed = sum(tried[status] for status in NOTICED)
         score = f"{100 * noticed / tried.total():.0f} %" if tried else "-"
-        print(f"{name:48} {len(found):7} {tried.total():6} {noticed:7}  {score:>5}")
+        print(f"{name:48} {len(statuses):7} {tried.total():6} {noticed:7}  {score:>5}")
         if options.survivors:
-            print(*(f"    {m}: {s}" for m, s in found.items() if s in ("survived", "no tests")), sep="\n")
+            print(*(f"    {m}: {s}" for m, s in statuses.items() if s in ("survived", "no tests")), sep="\n")
 
 
 if __name__ == "__main__":

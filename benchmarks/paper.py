@@ -71,16 +71,16 @@ def main() -> None:
     parser.add_argument("--pixels", type=int, default=Size().pixels, help="rows and columns of the camera")
     parser.add_argument("--frames", type=int, default=Size().frames, help="of a Stokes capture")
     parser.add_argument("--quick", action="store_true", help="one wavelength, one angle, a small camera")
-    given = parser.parse_args()
-    if SHOWN_DEG not in given.omega:
+    options = parser.parse_args()
+    if SHOWN_DEG not in options.omega:
         parser.error(f"--omega: the page shows images at {SHOWN_DEG:g} degrees, which must be among the angles")
-    fault_deg = tuple(omega for omega in Size().fault_deg if omega in given.omega)
-    size = Size(Size().wavelengths_nm, tuple(given.omega), fault_deg, given.pixels, given.frames)
-    if given.quick:
+    fault_deg = tuple(omega for omega in Size().fault_deg if omega in options.omega)
+    size = Size(Size().wavelengths_nm, tuple(options.omega), fault_deg, options.pixels, options.frames)
+    if options.quick:
         size = QUICK
-    out = given.out.resolve()
-    with tempfile.TemporaryDirectory() as temporary, executor(1 if given.quick else given.workers) as pool:
-        run((given.work or Path(temporary)).resolve(), out, size, pool, figure=given.figure)
+    out = options.out.resolve()
+    with tempfile.TemporaryDirectory() as temporary, executor(1 if options.quick else options.workers) as pool:
+        run((options.work or Path(temporary)).resolve(), out, size, pool, figure=options.figure)
 
 
 if __name__ == "__main__":

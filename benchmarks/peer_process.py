@@ -44,10 +44,10 @@ class PeerProcess:
             files.append(str(file))
 
         def run() -> float:
-            found = self._ask({"task": name, "data": files})
-            if "error" in found:
-                raise RuntimeError(found["error"])
-            return scale * float(found["seconds"])
+            reply = self._ask({"task": name, "data": files})
+            if "error" in reply:
+                raise RuntimeError(reply["error"])
+            return scale * float(reply["seconds"])
 
         return run
 
@@ -62,15 +62,15 @@ def peer_python(given: Path | None, console: Console) -> Path | None:
         return given
     folder = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "umov/peers"
     python = folder / "bin/python"
-    wanted, stamp = HERE / "requirements.txt", folder / "complete"
-    if not stamp.exists() or stamp.read_text() != wanted.read_text():
+    requirements, stamp = HERE / "requirements.txt", folder / "complete"
+    if not stamp.exists() or stamp.read_text() != requirements.read_text():
         console.print(f"making an environment for the peers in {folder} (once, about a minute)")
         venv.create(folder, with_pip=True, clear=True)
-        pip = [str(python), "-m", "pip", "install", "-q", "-r", str(wanted)]
+        pip = [str(python), "-m", "pip", "install", "-q", "-r", str(requirements)]
         done = subprocess.run(pip, check=False, capture_output=True, text=True)
         if done.returncode:
             console.print(done.stderr[-2000:])
             console.print("the peers could not be installed: comparing with numpy and OpenCV alone", style="yellow")
             return None
-        stamp.write_text(wanted.read_text())
+        stamp.write_text(requirements.read_text())
     return python

@@ -20,11 +20,11 @@ import numpy as np
 def versions() -> dict[str, str]:
     from importlib.metadata import PackageNotFoundError, version
 
-    found = {}
+    by_package = {}
     for name in ("numpy", "py_pol", "katsu", "muellerkit", "polanalyser", "pymueller", "opencv-python"):
         with contextlib.suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            by_package[name] = version(name)
+    return by_package
 
 
 def polanalyser_mueller(frames: Any, generator: Any, analyzer: Any) -> Callable[[], object]:

@@ -32,21 +32,21 @@ def one(
     from simulators.blind.bench_run import judge_bench
     from simulators.blind.real_bench import Polarimeter, make_bench, read_truth
 
-    group, seed, given = task
+    group, seed, capture_set = task
     name = f"{group}_{seed:04d}"
-    kept = folder / "results" / f"{name}_{given}.json"
-    if kept.exists() and not again:
-        return dict(json.loads(kept.read_text(encoding="utf-8"))["judgement"])
+    cache = folder / "results" / f"{name}_{capture_set}.json"
+    if cache.exists() and not again:
+        return dict(json.loads(cache.read_text(encoding="utf-8"))["judgement"])
     truth = next(read_truth(folder, name), None) or make_bench(
         folder, seed, ROOT / "configs", group, pixels=pixels, polarimeter=Polarimeter(**polarimeter)
     )
-    judgement, result = judge_bench(folder, truth, ROOT / "configs", given)
+    judgement, result = judge_bench(folder, truth, ROOT / "configs", capture_set)
     if oracle:
-        judgement = replace(judgement, oracle=known_oracle(folder, truth, ROOT / "configs", given))
-    kept.parent.mkdir(exist_ok=True)
+        judgement = replace(judgement, oracle=known_oracle(folder, truth, ROOT / "configs", capture_set))
+    cache.parent.mkdir(exist_ok=True)
     text = json.dumps({"judgement": asdict(judgement), "result": result}, indent=1)
-    kept.with_suffix(".partial").write_text(text, encoding="utf-8")
-    kept.with_suffix(".partial").replace(kept)
+    cache.with_suffix(".partial").write_text(text, encoding="utf-8")
+    cache.with_suffix(".partial").replace(cache)
     return asdict(judgement)
 
 
@@ -88,17 +88,17 @@ def main() -> None:
         "polarimeter": polarimeter,
     }
     run = partial(one, folder=options.folder, **more)
-    found = []
+    judgements = []
     with ProcessPoolExecutor(options.workers) as workers:
         for k, raw in enumerate(workers.map(run, tasks), 1):
-            found.append(judgement_of(raw))
+            judgements.append(judgement_of(raw))
             print(f"\r{k} of {len(tasks)}", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
-    for group, given in product(options.group, options.given):
-        print(f"== {group}, {given}")
-        print(table([j for j in found if (j.group, j.given) == (group, given)]))
+    for group, capture_set in product(options.group, options.given):
+        print(f"== {group}, {capture_set}")
+        print(table([j for j in judgements if (j.group, j.given) == (group, capture_set)]))
     if options.figure:
-        draw(found, options.figure)
+        draw(judgements, options.figure)
 
 
 if __name__ == "__main__":

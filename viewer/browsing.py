@@ -82,8 +82,8 @@ class Listed:
             entries = sorted(entries, key=lambda e: ((name := groups[group](e)) == "", natural(Path(name))))
             counts.update(map(groups[group], entries))
         pages = max(1, -(-len(entries) // MOST))
-        asked = query.get(f"{key}_page", "1")
-        page = min(max(int(asked) if asked.isdecimal() else 1, 1), pages)
+        number = query.get(f"{key}_page", "1")
+        page = min(max(int(number) if number.isdecimal() else 1, 1), pages)
         shown = entries[(page - 1) * MOST : page * MOST]
         of_shown = tuple((name, counts[name]) for e in shown if counts for name in [groups[group](e)])
         root = pages_of(request).root
@@ -125,18 +125,18 @@ def browse(request: Request) -> HTMLResponse:
     words = query.lower().split()
     notes = notes_of(library)
     none = Note()
-    found = [e for e in entries if all(w in e.words or w in notes.get(e.name, none).words for w in words)]
+    matches = [e for e in entries if all(w in e.words or w in notes.get(e.name, none).words for w in words)]
     views = [view for f in library.campaigns() if (view := read_campaign(f, library)) is not None]
     campaigns = [(v, running_in(library.root / v.name)) for v in views if all(w in v.name.lower() for w in words)]
-    products = Listed.of([e for e in found if e.kind not in ("capture", "unreadable")], "products", request)
+    products = Listed.of([e for e in matches if e.kind not in ("capture", "unreadable")], "products", request)
     return pages.draw(
         "browse.html",
-        simulated=_all_simulated(found),
+        simulated=_all_simulated(matches),
         query=query,
         campaigns=campaigns,
         statuses=STATUS,
         captures=Listed.of(
-            [e for e in found if e.kind in ("capture", "unreadable")],
+            [e for e in matches if e.kind in ("capture", "unreadable")],
             "captures",
             request,
             {"campaign": partial(_campaign_of, [view.name for view in views]), "sample": lambda e: e.sample},
@@ -144,7 +144,7 @@ def browse(request: Request) -> HTMLResponse:
         notes=notes,
         products=products,
         sources=[made_from(e, entries, library.root) for e in products.entries],
-        found=len(found),
+        found=len(matches),
         total=len(entries),
         shown_at=pages.shown_at,
         files=list(campaign_files(library)),

@@ -135,29 +135,29 @@ def read_campaign(folder: Path, library: Library, running: str | None = None) ->
 
 def _entry(path: Path, library: Library) -> Entry | None:
     # A capture may get its final name between the look at the one and at the other.
-    for there in (path, path.with_name(path.name + PARTIAL), path):
-        if library.holds(there):
+    for candidate in (path, path.with_name(path.name + PARTIAL), path):
+        if library.holds(candidate):
             with contextlib.suppress(NotHere):
-                return library.entry(library.name(there))
+                return library.entry(library.name(candidate))
     return None
 
 
 def _cell(
     number: int, name: str, plan: dict[str, Any], index: dict[str, Any], *, entry: Entry | None, running: bool
 ) -> Cell:
-    status, told = "missing", ""
+    status, remark = "missing", ""
     if running:
         status = "running"
     elif entry is not None and entry.status == "complete":
         flagged = bool(entry.flags) or float(index.get("saturated_fraction") or 0.0) > SATURATED
-        status, told = ("flagged" if flagged else "done"), "; ".join(entry.flags)
+        status, remark = ("flagged" if flagged else "done"), "; ".join(entry.flags)
     elif index.get("status") == "failed":
-        status, told = "failed", str(index.get("error") or "")
+        status, remark = "failed", str(index.get("error") or "")
     elif entry is not None:
         status = "failed" if entry.kind == "unreadable" else "partial"
-        told = "; ".join(entry.flags)
+        remark = "; ".join(entry.flags)
     if entry is not None and entry.states is not None:
-        told = f"{entry.states[0]} of {entry.states[1]} states" + (f"; {told}" if told else "")
+        remark = f"{entry.states[0]} of {entry.states[1]} states" + (f"; {remark}" if remark else "")
     sample = plan.get("sample", {})
     return Cell(
         number=number,
@@ -169,7 +169,7 @@ def _cell(
         reference=bool(index.get("reference")) or plan.get("role") == "flat" or sample.get("kind") == "air",
         status=status,
         file=None if entry is None else entry.name,
-        told=told,
+        told=remark,
     )
 
 
@@ -233,14 +233,14 @@ def seconds_left(view: CampaignView, run: dict[str, Any]) -> float | None:
     run : what the run says of itself (`acquisition.screen.run_file`).
     """
     left_s, pending, done = run.get("left_s"), run.get("pending") or 0, run.get("done") or 0
-    taken = sorted(
+    durations_s = sorted(
         (datetime.fromisoformat(bar.end) - datetime.fromisoformat(bar.start)).total_seconds()
         for bar in view.bars
         if bar.end is not None and bar.status in ("done", "flagged")
     )
     missing = sum(cell.status in ("missing", "partial", "failed") for cell in view.cells)
-    if taken:
-        each_s = taken[len(taken) // 2]
+    if durations_s:
+        each_s = durations_s[len(durations_s) // 2]
     elif left_s is not None and pending > done:
         each_s = left_s * pending / (pending - done)
     else:

@@ -51,16 +51,16 @@ def _choices(a: Path, b: Path) -> tuple[list[dict[str, Any]], tuple[int, int]]:
     if is_product(a) != is_product(b):
         raise ProcessError(f"{a.name} and {b.name}: a capture and a product have nothing in common to compare")
     if not is_product(a):
-        with Capture(a) as one, Capture(b) as other:
-            _same_shape(one.frame_shape, other.frame_shape)
-            count = min(len(one.done), len(other.done))
-            roles = one.role[:count]
-            choices = states_to_choose(one)[:count]
-            return sorted(choices, key=lambda c: roles[c["state"]] == "dark"), one.frame_shape
+        with Capture(a) as capture_a, Capture(b) as capture_b:
+            _same_shape(capture_a.frame_shape, capture_b.frame_shape)
+            count = min(len(capture_a.done), len(capture_b.done))
+            roles = capture_a.role[:count]
+            choices = states_to_choose(capture_a)[:count]
+            return sorted(choices, key=lambda c: roles[c["state"]] == "dark"), capture_a.frame_shape
     with Product(a) as first, Product(b) as second:
         _same_shape(first.shape, second.shape)
-        there = {(c["name"], c["index"]) for c in choices_of(second)}
-        return [c for c in choices_of(first) if (c["name"], c["index"]) in there], first.shape
+        available = {(c["name"], c["index"]) for c in choices_of(second)}
+        return [c for c in choices_of(first) if (c["name"], c["index"]) in available], first.shape
 
 
 def states_to_choose(capture: Capture) -> list[dict[str, Any]]:
@@ -92,30 +92,30 @@ def difference(request: Request) -> Response:
         with Product(a) as first, Product(b) as second:
             _same_shape(first.shape, second.shape)
             window = Window.asked(query, first.shape, most=640)
-            one, other = (product_values(product, query, window) for product in (first, second))
+            plane_a, plane_b = (product_values(product, query, window) for product in (first, second))
             shared = _shared_errors(first, second, query, window)
             systematic = _systematic_errors(first, second, query, window)
             name, index = asked_of(first, query)
             units = "" if name == "mueller" or name in DERIVED else first.units(name)
-            scale = scale_of("m00" if name == "mueller" and index == 0 else name, units, one[0])
+            scale = scale_of("m00" if name == "mueller" and index == 0 else name, units, plane_a[0])
     else:
         shared, systematic = None, np.zeros(())
         with Capture(a) as early, Capture(b) as late:
             _same_shape(early.frame_shape, late.frame_shape)
             window = Window.asked(query, early.frame_shape, most=640)
-            one, other = (capture_values(capture, query, window) for capture in (early, late))
-            name, units, scale = None, "counts", ColourScale(LIGHT, *_ends(one[0]))
-    apart = one[0] - other[0]
+            plane_a, plane_b = (capture_values(capture, query, window) for capture in (early, late))
+            name, units, scale = None, "counts", ColourScale(LIGHT, *_ends(plane_a[0]))
+    apart = plane_a[0] - plane_b[0]
     if (period := None if name is None else period_deg(name, units)) is not None:
         apart = (apart + period / 2) % period - period / 2
-    noise = np.hypot(one[1], other[1]) if shared is None else shared
+    noise = np.hypot(plane_a[1], plane_b[1]) if shared is None else shared
     with np.errstate(divide="ignore", invalid="ignore"):
         over = apart / np.hypot(noise, systematic)
     wide = scale_of("deviation", "", apart)
     scales = [scale, scale, wide, ColourScale(SIGNED, -ERRORS_SHOWN, ERRORS_SHOWN)]
     return sent(
         window,
-        np.stack([one[0], other[0], apart, over]).astype(np.float32),
+        np.stack([plane_a[0], plane_b[0], apart, over]).astype(np.float32),
         scales=[{"colours": s.colours, "low": s.low, "high": s.high} for s in scales],
         units=units_words(units),
         rms=_rms(apart),
@@ -126,8 +126,8 @@ def difference(request: Request) -> Response:
 
 
 def _rms(values: NDArray[np.floating]) -> float | None:
-    known = values[np.isfinite(values)].astype(float)
-    return float(np.sqrt(np.mean(known**2))) if known.size else None
+    valid = values[np.isfinite(values)].astype(float)
+    return float(np.sqrt(np.mean(valid**2))) if valid.size else None
 
 
 def _ends(counts: NDArray[np.float32]) -> tuple[float, float]:
@@ -181,10 +181,10 @@ def _systematic_errors(first: Product, second: Product, query: Any, window: Wind
     Products with the same uncertain inputs are of one instrument: its error leaves the difference as far as it moves
     both alike. Where only the size of both errors is known, they add.
     """
-    (one, a), (other, b) = (_moved(product, query, window) for product in (first, second))
+    (move_a, a), (move_b, b) = (_moved(product, query, window) for product in (first, second))
     if first.facts.get(INPUTS) != second.facts.get(INPUTS):
         return np.asarray(np.hypot(a, b))
-    return np.asarray(a + b if one is None or other is None else np.sqrt(np.square(one - other).sum(axis=0)))
+    return np.asarray(a + b if move_a is None or move_b is None else np.sqrt(np.square(move_a - move_b).sum(axis=0)))
 
 
 def _moved(product: Product, query: Any, window: Window) -> tuple[NDArray[np.floating] | None, NDArray[np.floating]]:

@@ -57,8 +57,8 @@ class Story:
     @property
     def model(self) -> str:
         """Name of the material, or of the instrument."""
-        found = self.diagnosis
-        return found.material if isinstance(found, SurfaceDiagnosis) else found.instrument
+        diagnosis = self.diagnosis
+        return diagnosis.material if isinstance(diagnosis, SurfaceDiagnosis) else diagnosis.instrument
 
     @property
     def verdict(self) -> str:
@@ -147,11 +147,11 @@ class Diagnoses:
 
     def of_capture(self, capture: str) -> list[Story]:
         """Diagnoses that a capture took part in, the newest first; without those that cannot be read."""
-        found = []
+        stories = []
         for path in sorted(self._folder.glob("*/diagnosis.json"), reverse=True):
             with contextlib.suppress(ProcessError):
-                found.append(self.story(path.parent.name))
-        return [story for story in found if capture in story.captures]
+                stories.append(self.story(path.parent.name))
+        return [story for story in stories if capture in story.captures]
 
     def residuals(self, name: str) -> list[StoredResidual]:
         """Residuals of its captures, before and after."""
@@ -180,8 +180,8 @@ class Diagnoses:
         else:
             write_instrument(path, model, story.diagnosis, note)
             written = [path]
-        first, *others = (path.name for path in written)
-        self._decide(name, {"accepted": True, "file": first, "beside": others, "note": note})
+        first, *companions = (path.name for path in written)
+        self._decide(name, {"accepted": True, "file": first, "beside": companions, "note": note})
         return written
 
     def reject(self, name: str, note: str) -> None:

@@ -36,19 +36,19 @@ def seen(folder: Path, library: Library) -> dict[str, Any]:
     """What a page shows of a running campaign, or that none runs."""
     run = running_in(folder)
     view = read_campaign(folder, library, None if run is None else run.get("capture"))
-    found: dict[str, Any] = {"running": run is not None}
+    state: dict[str, Any] = {"running": run is not None}
     if view is not None:
-        found |= {"complete": view.complete, "cells": {cell.name: cell.status for cell in view.cells}}
-        found["logged"] = view.events[:1]
+        state |= {"complete": view.complete, "cells": {cell.name: cell.status for cell in view.cells}}
+        state["logged"] = view.events[:1]
         if run is not None:
-            found["night_s"] = seconds_left(view, run)
+            state["night_s"] = seconds_left(view, run)
     if run is None:
-        return found
-    found |= {key: run.get(key) for key in ("title", "activity", "done", "pending", "left_s", "messages", "capture")}
-    found |= {"number": run.get("campaign_done", 0) + 1, "total": run.get("campaign_total", 1)}
-    found["axes"] = run.get("axes") or {}
-    found |= _taken(folder / str(run.get("capture")), library)
-    return found
+        return state
+    state |= {key: run.get(key) for key in ("title", "activity", "done", "pending", "left_s", "messages", "capture")}
+    state |= {"number": run.get("campaign_done", 0) + 1, "total": run.get("campaign_total", 1)}
+    state["axes"] = run.get("axes") or {}
+    state |= _taken(folder / str(run.get("capture")), library)
+    return state
 
 
 def _taken(final: Path, library: Library) -> dict[str, Any]:
@@ -62,8 +62,8 @@ def _taken(final: Path, library: Library) -> dict[str, Any]:
 
 async def stop(request: Request) -> JSONResponse:
     """Send the process of the run what Ctrl-C sends. Raises ProcessError where none runs."""
-    asked = await fields_of(request)
-    folder = pages_of(request).library.path(asked.get("folder", ""))
+    fields = await fields_of(request)
+    folder = pages_of(request).library.path(fields.get("folder", ""))
     run = running_in(folder)
     if run is None:
         raise ProcessError("no run is active in this folder")

@@ -119,12 +119,12 @@ class Jobs:
 
     def all(self) -> list[PageJob]:
         """Every job, the newest first."""
-        found = []
+        jobs = []
         for path in sorted(self._folder.glob("*/job.json"), reverse=True):
             # Just being written, or cut off by a full disc.
             with contextlib.suppress(ProcessError):
-                found.append(self.job(path.parent.name))
-        return found
+                jobs.append(self.job(path.parent.name))
+        return jobs
 
     def running(self, job: PageJob) -> bool:
         """Whether its process is still there."""

@@ -32,14 +32,14 @@ def lamp(capture: Capture) -> dict[str, Any]:
     except ProcessError as error:
         return {"states": [], "ratio": [], "told": str(error)}
     if fitted is not None:
-        told = "dark-corrected mean of each state over what polarization makes of it by the other states"
-        return _told(capture, light, signal / fitted, told)
+        method = "dark-corrected mean of each state over what polarization makes of it by the other states"
+        return _told(capture, light, signal / fitted, method)
     same = _repeats(capture, light)
     if same.sum() > 1:
-        told = f"dark-corrected mean of the {int(same.sum())} states that repeat the pose of the first one"
-        return _told(capture, light[same], signal[same] / signal[same][0], told)
-    told = "shown once enough states separate the lamp from polarization"
-    return {"states": [], "ratio": [], "told": told}
+        method = f"dark-corrected mean of the {int(same.sum())} states that repeat the pose of the first one"
+        return _told(capture, light[same], signal[same] / signal[same][0], method)
+    method = "shown once enough states separate the lamp from polarization"
+    return {"states": [], "ratio": [], "told": method}
 
 
 def _told(capture: Capture, states: NDArray[np.int64], ratio: NDArray[np.float64], told: str) -> dict[str, Any]:
@@ -76,10 +76,10 @@ def _fitted(capture: Capture, light: NDArray[np.int64], signal: NDArray[np.float
     changes = capture_changes(capture, model, light)
     # Beams and the analyzers of a mosaic have as many pixels each: the mean of a frame is that of all.
     w = model.rows(angles_of(capture, model, light), changes).mean(axis=1)
-    known = np.isfinite(signal)
-    if known.sum() < np.linalg.matrix_rank(w[known], rtol=1e-6) + SPARE:
+    is_finite = np.isfinite(signal)
+    if is_finite.sum() < np.linalg.matrix_rank(w[is_finite], rtol=1e-6) + SPARE:
         return None
-    return np.asarray(_from_the_others(w, signal, known))
+    return np.asarray(_from_the_others(w, signal, is_finite))
 
 
 def _from_the_others(

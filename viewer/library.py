@@ -117,52 +117,52 @@ class Library:
     def entries(self) -> list[Entry]:
         """Every HDF5 file, newest first."""
         with self._lock:
-            found = [self._entry(path) for path in self._files(".h5", f".h5{PARTIAL}")]
+            candidates = [self._entry(path) for path in self._files(".h5", f".h5{PARTIAL}")]
             if self._read_anew >= READ_ANEW:
                 self._save_index()
         # A link has the name of the file that it leads to, which is listed once.
-        by_name = {e.name: e for e in found if e is not None}
+        by_name = {e.name: e for e in candidates if e is not None}
         return sorted(by_name.values(), key=lambda e: (-e.changed_s, e.name))
 
     def entry(self, name: str) -> Entry:
         """One file. Raises NotHere."""
         with self._lock:
-            found = self._entry(self.path(name))
-        if found is None:
+            result = self._entry(self.path(name))
+        if result is None:
             raise NotHere(f"{name}: there is no such file in {self.root}")
-        return found
+        return result
 
     def campaigns(self) -> list[Path]:
         """Folders that campaigns were taken into, the one last written to first."""
-        found = [Path(folder) for folder, _, files in self._walk() if IDENTITY in files]
-        return sorted(found, key=lambda folder: -_changed_s(folder))
+        folders = [Path(folder) for folder, _, files in self._walk() if IDENTITY in files]
+        return sorted(folders, key=lambda folder: -_changed_s(folder))
 
     def yaml_files(self, mark: str) -> list[Path]:
         """Configuration files that have a line which begins so, as `kind: instrument`."""
-        found = []
+        paths = []
         for path in self._files(".yaml"):
             if path.stat().st_size < 1 << 20 and any(f"{line} ".startswith(f"{mark} ") for line in _lines(path)):
-                found.append(path)
-        return found
+                paths.append(path)
+        return paths
 
     def _load_index(self) -> None:
         """What an earlier run knew; nothing of a damaged index, or of another version of this program."""
         try:
-            kept = json.loads((self.root / OWN / INDEX).read_text(encoding="utf-8"))
-            for name, (seen, facts) in kept["files"].items() if kept["program"] == program() else ():
+            index = json.loads((self.root / OWN / INDEX).read_text(encoding="utf-8"))
+            for name, (stamp, facts) in index["files"].items() if index["program"] == program() else ():
                 header = facts["header"] and CaptureHeader.model_validate(facts["header"])
                 lists = {key: tuple(facts[key]) for key in ("flags", "inputs")}
                 lists["states"] = facts["states"] and tuple(facts["states"])
-                self._known[self.root / name] = (tuple(seen), Entry(**(facts | lists | {"header": header})))
+                self._known[self.root / name] = (tuple(stamp), Entry(**(facts | lists | {"header": header})))
         except (OSError, ValueError, KeyError, TypeError):
             self._known.clear()
 
     def _save_index(self) -> None:
         files = {}
-        for seen, entry in self._known.values():
+        for stamp, entry in self._known.values():
             header = entry.header and entry.header.model_dump(mode="json", exclude=LONG)
             facts = {f.name: getattr(entry, f.name) for f in fields(entry)} | {"header": header}
-            files[entry.name] = (seen, facts)
+            files[entry.name] = (stamp, facts)
         try:
             (self.root / OWN).mkdir(exist_ok=True)
             write_whole_text(self.root / OWN / INDEX, json.dumps({"program": program(), "files": files}))
@@ -187,8 +187,8 @@ class Library:
             stat = path.stat()
         except OSError:
             return None
-        seen = (stat.st_mtime_ns, stat.st_size)
-        if path in self._known and self._known[path][0] == seen:
+        stamp = (stat.st_mtime_ns, stat.st_size)
+        if path in self._known and self._known[path][0] == stamp:
             return self._known[path][1]
         self._read_anew += 1
         common: dict[str, Any] = {"name": self.name(path), "changed_s": stat.st_mtime, "size": stat.st_size}
@@ -203,7 +203,7 @@ class Library:
         if entry.status == "running":
             self._known.pop(path, None)
         else:
-            self._known[path] = (seen, entry)
+            self._known[path] = (stamp, entry)
         return entry
 
 
@@ -261,8 +261,8 @@ def made_from(entry: Entry, entries: list[Entry], root: Path) -> list[tuple[str,
 
 def input_of(identity: dict[str, Any], entries: list[Entry], root: Path) -> Entry | None:
     """The file in the folder that an input was: by what it was made of, by its path, or moved with its folder."""
-    path, known = str(identity.get("path", "")), identity.get(MADE_OF)
-    if known is not None and (same := next((e for e in entries if e.content == known), None)):
+    path, content = str(identity.get("path", "")), identity.get(MADE_OF)
+    if content is not None and (same := next((e for e in entries if e.content == content), None)):
         return same
     if same := next((e for e in entries if f"{root}/{e.name}" == path), None):
         return same

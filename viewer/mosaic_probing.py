@@ -51,15 +51,15 @@ class SuperPixelReducer:
         ------
         ProcessError : it is too large.
         """
-        whole, signal = self._signal(region)
-        pixels = whole.pixels // len(self._layout.channels)
+        block, signal = self._signal(region)
+        pixels = block.pixels // len(self._layout.channels)
         a = np.kron(self._relative[:, None], self._analyzers)
         solve = np.linalg.pinv(a)
         s = solve @ signal
         fitted = a @ s
         variance = self._variance(fitted, len(self._layout.channels)) / pixels
-        known = self._noise is not None
-        if not known:
+        has_noise = self._noise is not None
+        if not has_noise:
             variance = np.full(len(signal), np.sum((signal - fitted) ** 2) / max(len(signal) - len(s), 1))
         residual = (signal - fitted) / np.sqrt(variance)
         covariance = (solve * variance) @ solve.T
@@ -71,9 +71,9 @@ class SuperPixelReducer:
             "noise": finite(np.sqrt(variance)),
             "residual": finite(residual),
             "chi_square": finite(np.sum(residual**2) / max(len(signal) - len(s), 1)),
-            "noise_known": known,
+            "noise_known": has_noise,
             "stokes": _stokes(s, covariance),
-            "told": f"{self._model.name}; {whole}; black: {self._correction.source}",
+            "told": f"{self._model.name}; {block}; black: {self._correction.source}",
         }
 
     def _signal(self, region: Region) -> tuple[Region, NDArray[np.float64]]:
@@ -82,7 +82,7 @@ class SuperPixelReducer:
                 slice(part.start // 2 * 2, min(-(-part.stop // 2) * 2, size // 2 * 2))
                 for part, size in zip((region.rows, region.columns), capture.frame_shape, strict=True)
             )
-            whole = Region(rows, columns)
+            block = Region(rows, columns)
             if (rows.stop - rows.start) * capture.frame_shape[1] * len(self._states) > MOST:
                 raise ProcessError(f"{region} is more than is reduced at once; draw a smaller one")
             reader = BlockReader(capture, self._states, self._correction, self._counts)
@@ -92,7 +92,7 @@ class SuperPixelReducer:
             width = capture.frame_shape[1]
         image = signal.reshape(len(self._states), -1, width)[:, :, columns]
         means = [image[:, row::2, column::2].mean(axis=(1, 2), dtype=float) for row, column in self._layout.offsets]
-        return whole, np.stack(means, axis=1).ravel()
+        return block, np.stack(means, axis=1).ravel()
 
     def _variance(self, signal: NDArray[np.float64], channels: int) -> NDArray[np.float64]:
         """Of one raw pixel (N channels,), counts^2."""

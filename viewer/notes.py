@@ -47,8 +47,8 @@ def notes_of(library: Library) -> dict[str, Note]:
 
 async def write_note(request: Request) -> JSONResponse:
     """Keep the note and the tags of a file; without both it has none."""
-    asked = await fields_of(request)
-    return await run_in_threadpool(_write_note, pages_of(request).library, asked)
+    fields = await fields_of(request)
+    return await run_in_threadpool(_write_note, pages_of(request).library, fields)
 
 
 def _write_note(library: Library, asked: dict[str, str]) -> JSONResponse:

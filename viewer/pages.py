@@ -58,8 +58,8 @@ class Pages:
 
     def address(self, what: str, **query: object) -> str:
         """Address of a page or a picture, with what it is asked."""
-        asked = urlencode({key: v for key, v in query.items() if v is not None}, errors="surrogateescape")
-        return f"{self.root}/{what}" + (f"?{asked}" if asked else "")
+        parameters = urlencode({key: v for key, v in query.items() if v is not None}, errors="surrogateescape")
+        return f"{self.root}/{what}" + (f"?{parameters}" if parameters else "")
 
     def shown_at(self, entry: Entry) -> str | None:
         """Address of the page that shows a file; None for one that has no page."""
@@ -86,10 +86,10 @@ async def fields_of(request: Request) -> dict[str, str]:
         sent += part
         if len(sent) > MOST_SENT:
             raise ProcessError(f"a page sends at most {MOST_SENT:,} bytes")
-    asked = parse_json(sent, "what the page sent")
-    if not isinstance(asked, dict) or not all(isinstance(value, str) for value in asked.values()):
+    fields = parse_json(sent, "what the page sent")
+    if not isinstance(fields, dict) or not all(isinstance(value, str) for value in fields.values()):
         raise ProcessError("a page sends named texts")
-    return asked
+    return fields
 
 
 def whole_style() -> str:

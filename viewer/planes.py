@@ -82,7 +82,7 @@ def _inside(first: float, last: float, length: int) -> slice:
 
 def sent(window: Window, image: NDArray[Any], **facts: Any) -> Response:
     """A picture as numbers: 4-byte floats row by row, the rest as JSON in a header."""
-    told = {
+    header = {
         "x0": window.columns.start,
         "y0": window.rows.start,
         "step": window.step,
@@ -91,4 +91,4 @@ def sent(window: Window, image: NDArray[Any], **facts: Any) -> Response:
         **facts,
     }
     body = np.ascontiguousarray(image, dtype="<f4").tobytes()
-    return Response(body, media_type="application/octet-stream", headers={"X-Plane": json.dumps(told)})
+    return Response(body, media_type="application/octet-stream", headers={"X-Plane": json.dumps(header)})

@@ -33,11 +33,11 @@ def curve_of(request: Request) -> JSONResponse:
 def _curve_of(path: Path, query: Any) -> dict[str, Any]:
     with Capture(path) as capture:
         region = Region.asked(query, capture.frame_shape)
-        found = raw_curve(capture, region, chosen(capture, {"channel": query.get("channel", 0)})[1])
+        raw = raw_curve(capture, region, chosen(capture, {"channel": query.get("channel", 0)})[1])
         running = capture.status == "running"
     if running:
-        return found | {"told": "The capture is being taken; the fit comes when it is complete."}
-    return found | _fit(path, region, None)
+        return raw | {"told": "The capture is being taken; the fit comes when it is complete."}
+    return raw | _fit(path, region, None)
 
 
 def matrix_of(request: Request) -> JSONResponse:
@@ -90,29 +90,29 @@ def _of_product(path: Path, query: Any, library: Library) -> dict[str, Any]:
     with Product(path) as product:
         shape = product.shape
         region = Region.asked(query, shape)
-        found: dict[str, Any] = {"where": str(region), "planes": _planes(product, region), "told": ""}
+        answer: dict[str, Any] = {"where": str(region), "planes": _planes(product, region), "told": ""}
         if "pixel_flags" in product.names:
             bits = product.get("pixel_flags", region.rows)[:, region.columns]
-            found["mask"] = Mask.words(int(bits.max())) if bits.any() else "valid"
+            answer["mask"] = Mask.words(int(bits.max())) if bits.any() else "valid"
         if product.kind in ("mueller", EXTRAPOLATED) and region.pixels == 1:
             image = image_of(product, region.rows)
-            found["matrix"] = matrix(image.at(np.array([region.columns.start])))
+            answer["matrix"] = matrix(image.at(np.array([region.columns.start])))
         source = capture_of(product, library)
     if source is None:
-        return found | {"told": "The capture behind this product is not in the folder."}
+        return answer | {"told": "The capture behind this product is not in the folder."}
     path, instrument = source
     with Capture(path) as capture:
         # A Stokes image may have one pixel for each super-pixel.
         region = region.enlarged(capture.frame_shape[0] // shape[0])
-        found |= raw_curve(capture, region, 0) | {"where": found["where"]}
-    found |= _fit(path, region, instrument)
-    if "matrix" not in found and "fit" in found:
-        found |= _matrix(path, region, instrument)
-    return found
+        answer |= raw_curve(capture, region, 0) | {"where": answer["where"]}
+    answer |= _fit(path, region, instrument)
+    if "matrix" not in answer and "fit" in answer:
+        answer |= _matrix(path, region, instrument)
+    return answer
 
 
 def _planes(product: Product, region: Region) -> list[dict[str, Any]]:
-    told, correlation = [], neighbour_correlation(product)
+    entries, correlation = [], neighbour_correlation(product)
     for name in product.names:
         # The flags are told in words.
         if name.endswith((*COMPANIONS, "covariance")) or name in ("mueller", "pixel_flags"):
@@ -128,15 +128,15 @@ def _planes(product: Product, region: Region) -> list[dict[str, Any]]:
             if errors in product.names:
                 each = product.get(errors, region.rows)[..., region.columns].astype(float)
                 each = each.reshape(-1, *each.shape[-2:])
-                whole = np.zeros(each.shape[1:], int)
+                labels = np.zeros(each.shape[1:], int)
                 # An error that is not known leaves that of the mean unknown.
-                total = [shared_variance(whole, one, correlation).sum() + 0 * one.sum() for one in each]
+                total = [shared_variance(labels, sigma, correlation).sum() + 0 * sigma.sum() for sigma in each]
                 entry["error"] = finite(np.sqrt(total) / region.pixels)
             if f"{name}_systematic" in product.names:
                 each = product.get(f"{name}_systematic", region.rows)[..., region.columns]
                 entry["systematic"] = finite(each.reshape(-1, region.pixels).mean(axis=1, dtype=float))
-        told.append(entry)
-    return told
+        entries.append(entry)
+    return entries
 
 
 def _mean(values: NDArray[np.float64], period: float | None) -> NDArray[np.float64]:

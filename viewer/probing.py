@@ -122,8 +122,8 @@ class PixelReducer:
         """How a region is reduced, in a few words."""
         model = self.reduction.model
         effects = f", {len(model.effects)} effect(s)" if model.effects else ""
-        whole = f"; {region.reduced(self._cell).enlarged(self._cell)}" if self._cell > 1 else ""
-        return f"{model.name}{effects}{whole}; black: {self.reduction.correction.source}"
+        cells = f"; {region.reduced(self._cell).enlarged(self._cell)}" if self._cell > 1 else ""
+        return f"{model.name}{effects}{cells}; black: {self.reduction.correction.source}"
 
 
 def analyzer_names(channels: Sequence[str]) -> list[str]:
@@ -159,9 +159,9 @@ def curve(reducer: PixelReducer, region: Region) -> dict[str, Any]:
 
 def matrix(image: MuellerImage | ExtrapolatedImage) -> dict[str, Any]:
     """Mueller matrix over m00 with its standard errors, and what it decomposes into."""
-    seen = (image.seen if isinstance(image, MuellerImage) else np.ones(16, dtype=bool)).reshape(4, 4)
-    m, errors = (np.where(seen, v.reshape(4, 4), np.nan).astype(float) for v in (image.values, image.errors))
-    derived = quantities_block(image, (), {}) if seen.all() else {}
+    measured = (image.seen if isinstance(image, MuellerImage) else np.ones(16, dtype=bool)).reshape(4, 4)
+    m, errors = (np.where(measured, v.reshape(4, 4), np.nan).astype(float) for v in (image.values, image.errors))
+    derived = quantities_block(image, (), {}) if measured.all() else {}
     named = {name: values.reshape(-1).astype(float) for name, values in derived.items()}
     with np.errstate(divide="ignore", invalid="ignore"):
         normalized = m / m[0, 0]

@@ -66,12 +66,12 @@ def product(request: Request) -> HTMLResponse:
 
 def maps_of(opened: Product) -> list[dict[str, Any]]:
     """Maps of a product, its main one first: each dataset without its errors, one entry for each number of a vector."""
-    found = []
+    maps = []
     first = FIRST.get(opened.kind, opened.kind)
     if is_stokes_vector(opened) and "stokes" not in opened.names:
         # The first column of M, which is the Stokes vector.
         column = {"name": "mueller", "about": opened.long_name("mueller"), "units": "count", "errors": True}
-        found = [column | {"index": 4 * k, "label": f"S{k}"} for k in range(4)]
+        maps = [column | {"index": 4 * k, "label": f"S{k}"} for k in range(4)]
     if "stokes" in opened.names:
         first = "stokes"
     for name in sorted(opened.names, key=lambda name: name != first):
@@ -82,26 +82,26 @@ def maps_of(opened: Product) -> list[dict[str, Any]]:
         common["errors"] = f"{name}_errors" in opened.names
         if count <= 16:
             words = name.replace("_", " ")
-            found += [common | {"index": k, "label": words if count == 1 else f"{words} {k}"} for k in range(count)]
-    return found
+            maps += [common | {"index": k, "label": words if count == 1 else f"{words} {k}"} for k in range(count)]
+    return maps
 
 
 def choices_of(product: Product) -> list[dict[str, Any]]:
     """What a product can be asked for: elements over m00, its maps, quantities of a whole M."""
-    found = maps_of(product)
+    choices = maps_of(product)
     if is_stokes_vector(product):
         elements = [{"label": f"S{k} over S0", "name": "mueller", "index": 4 * k} for k in range(1, 4)]
-        found = [
+        choices = [
             *elements,
             {"label": "S0", "name": "mueller", "index": 0},
-            *(m for m in found if m["name"] != "mueller"),
+            *(m for m in choices if m["name"] != "mueller"),
         ]
     elif product.kind in MATRICES:
         elements = [{"label": f"m{k // 4}{k % 4} over m00", "name": "mueller", "index": k} for k in range(1, 16)]
-        found = [*elements, {"label": "m00", "name": "mueller", "index": 0}, *found]
+        choices = [*elements, {"label": "m00", "name": "mueller", "index": 0}, *choices]
     if is_whole(product):
-        found += [{"label": name.replace("_", " "), "name": name, "index": 0} for name in DERIVED]
-    return found
+        choices += [{"label": name.replace("_", " "), "name": name, "index": 0} for name in DERIVED]
+    return choices
 
 
 def is_whole(product: Product) -> bool:

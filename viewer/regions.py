@@ -75,8 +75,8 @@ def kept_regions(library: Library) -> list[NamedRegion]:
 
 async def keep_region(request: Request) -> JSONResponse:
     """Name a region of an image; a region of that name moves."""
-    asked = await fields_of(request)
-    return await run_in_threadpool(_keep_region, pages_of(request).library, asked)
+    fields = await fields_of(request)
+    return await run_in_threadpool(_keep_region, pages_of(request).library, fields)
 
 
 def _keep_region(library: Library, asked: dict[str, str]) -> JSONResponse:
@@ -87,23 +87,23 @@ def _keep_region(library: Library, asked: dict[str, str]) -> JSONResponse:
     columns, rows = ((part.start, part.stop) for part in (place.columns, place.rows))
     fresh = NamedRegion(name=name, columns=columns, rows=rows, image=shape)
     with _lock:
-        by_name = {one.name: one for one in kept_regions(library)} | {name: fresh}
+        by_name = {region.name: region for region in kept_regions(library)} | {name: fresh}
         write_kept(library, FILE, _RegionsFile(regions=list(by_name.values())))
     return JSONResponse({"name": name})
 
 
 async def drop_region(request: Request) -> JSONResponse:
     """Forget a region. Raises NotHere."""
-    asked = await fields_of(request)
-    return await run_in_threadpool(_drop_region, pages_of(request).library, asked.get("name", ""))
+    fields = await fields_of(request)
+    return await run_in_threadpool(_drop_region, pages_of(request).library, fields.get("name", ""))
 
 
 def _drop_region(library: Library, name: str) -> JSONResponse:
     with _lock:
-        kept = kept_regions(library)
-        if all(one.name != name for one in kept):
+        saved = kept_regions(library)
+        if all(region.name != name for region in saved):
             raise NotHere(f"{name}: there is no such region")
-        write_kept(library, FILE, _RegionsFile(regions=[one for one in kept if one.name != name]))
+        write_kept(library, FILE, _RegionsFile(regions=[region for region in saved if region.name != name]))
     return JSONResponse({"name": name})
 
 
@@ -137,7 +137,7 @@ def table(request: Request) -> Response:
 
 
 def _named(library: Library, shape: tuple[int, int]) -> list[tuple[str, Region]]:
-    return [(one.name, found) for one in kept_regions(library) if (found := one.on(shape)) is not None]
+    return [(region.name, area) for region in kept_regions(library) if (area := region.on(shape)) is not None]
 
 
 @dataclass(frozen=True)
@@ -178,18 +178,18 @@ class MeasuredImage:
         """Mean, spread, histogram and profiles of a region, without the pixels that have no value."""
         if region.pixels > MOST:
             raise ProcessError(f"{region} is more than is read at once; draw a smaller one")
-        found = self._pixels(region, query)
-        good = np.isfinite(found.values)
+        pixels = self._pixels(region, query)
+        good = np.isfinite(pixels.values)
         count = int(good.sum())
         (x0, x1), (y0, y1) = ((part.start, part.stop) for part in (region.columns, region.rows))
         row = {"name": name, "where": str(region), "x0": x0, "x1": x1, "y0": y0, "y1": y1, "pixels": count}
-        row |= {"unit": units_words(found.units), "value": None, "error": None, "systematic": None, "spread": None}
+        row |= {"unit": units_words(pixels.units), "value": None, "error": None, "systematic": None, "spread": None}
         if not count:
             return row | {"histogram": {"edges": [], "pixels": []}, "columns": [], "rows": []}
-        own = float(_mean(found.values[good], found.period, 0))
-        off = _apart(found.values - own, found.period)
-        value, error, systematic = found.mean or (own, _error(found, good), _systematic(found, good))
-        edges = _edges(found.values[good] if found.period is None else own + off[good])
+        mean = float(_mean(pixels.values[good], pixels.period, 0))
+        off = _apart(pixels.values - mean, pixels.period)
+        value, error, systematic = pixels.mean or (mean, _error(pixels, good), _systematic(pixels, good))
+        edges = _edges(pixels.values[good] if pixels.period is None else mean + off[good])
         return row | {
             "value": finite(value),
             "error": finite(error),
@@ -197,10 +197,10 @@ class MeasuredImage:
             "spread": finite(off[good].std(ddof=1)) if count > 1 else None,
             "histogram": {
                 "edges": edges.tolist(),
-                "pixels": np.histogram(own + off[good], edges)[0].tolist(),
+                "pixels": np.histogram(mean + off[good], edges)[0].tolist(),
             },
-            "columns": finite(_mean(found.values, found.period, 0)),
-            "rows": finite(_mean(found.values, found.period, 1)),
+            "columns": finite(_mean(pixels.values, pixels.period, 0)),
+            "rows": finite(_mean(pixels.values, pixels.period, 1)),
         }
 
     def _pixels(self, region: Region, query: Any) -> _Pixels:
@@ -248,21 +248,21 @@ def _ends(part: slice) -> tuple[int, int]:
 def _means(path: Path, changed: int, place: tuple[int, int, int, int]) -> dict[str, tuple[float, float, float]]:
     """Means of a region by name, with their errors; none where no pixel can be used."""
     try:
-        found = mean_of([path], (slice(*place[:2]), slice(*place[2:])))
+        means = mean_of([path], (slice(*place[:2]), slice(*place[2:])))
     except ProcessError:
         return {}
     # Without an uncertain input the instrument's share is not zero, but not stated.
-    return {one.name: (one.value, one.u_noise, one.u_systematic if one.budget[1:] else np.nan) for one in found}
+    return {mean.name: (mean.value, mean.u_noise, mean.u_systematic if mean.budget[1:] else np.nan) for mean in means}
 
 
 def _mean(values: NDArray[np.float64], period: float | None, axis: int) -> NDArray[np.float64]:
     """Mean along an axis of what is finite; of orientations, that of 1 and 179 degrees is 0 and not 90."""
     good = np.isfinite(values)
-    known = np.where(good, values, 0)
+    filled = np.where(good, values, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         if period is None:
-            return np.asarray(known.sum(axis=axis) / good.sum(axis=axis))
-        turns = np.where(good, np.exp(2j * np.pi * known / period), 0).sum(axis=axis) / good.sum(axis=axis)
+            return np.asarray(filled.sum(axis=axis) / good.sum(axis=axis))
+        turns = np.where(good, np.exp(2j * np.pi * filled / period), 0).sum(axis=axis) / good.sum(axis=axis)
     return np.asarray(np.angle(turns) / (2 * np.pi) * period % period)
 
 
@@ -285,8 +285,8 @@ def _systematic(found: _Pixels, good: NDArray[np.bool_]) -> float:
 
 def _edges(values: NDArray[np.float64]) -> NDArray[np.float64]:
     low, high = float(values.min()), float(values.max())
-    whole = bool((values == np.round(values)).all())
-    if whole:
+    is_whole = bool((values == np.round(values)).all())
+    if is_whole:
         # Whole counts: bars of a whole number of counts each.
         wide = max(1, -(-int(high - low + 1) // BARS))
         return np.arange(low, high + wide + 1, wide) - 0.5

@@ -54,7 +54,7 @@ def stack(request: Request) -> HTMLResponse:
         words=query.get("q", ""),
         count=len(entries),
         choices=choices,
-        places=[MIDDLE, *(one.name for one in kept_regions(pages.library))],
+        places=[MIDDLE, *(region.name for region in kept_regions(pages.library))],
         axes=AXES,
         # Without anything that differs these are repeats.
         over=most if varied[most] > 1 else "time",
@@ -88,9 +88,9 @@ def _kinds(pages: Pages) -> dict[str, int]:
 
 
 def _chosen(pages: Pages, kind: str, words: str) -> list[Entry]:
-    asked = words.lower().split()
-    found = [e for e in pages.library.entries() if e.kind == kind and all(word in e.words for word in asked)]
-    return sorted(found, key=lambda e: natural(Path(e.name)))[:MOST_FILES]
+    terms = words.lower().split()
+    matches = [e for e in pages.library.entries() if e.kind == kind and all(word in e.words for word in terms)]
+    return sorted(matches, key=lambda e: natural(Path(e.name)))[:MOST_FILES]
 
 
 def _place(entry: Entry) -> dict[str, Any]:
@@ -102,7 +102,7 @@ def _place(entry: Entry) -> dict[str, Any]:
 def _points(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
     """A point for each product, and why others have none."""
     pages, query = pages_of(request), request.query_params
-    named = {one.name: one for one in kept_regions(pages.library)}
+    named = {area.name: area for area in kept_regions(pages.library)}
     where = query.get("region", MIDDLE)
     if where != MIDDLE and where not in named:
         raise NotHere(f"{where}: there is no such region")

@@ -32,12 +32,12 @@ def jobs_of(request: Request) -> Jobs:
 
 async def start(request: Request) -> JSONResponse:
     """Start what the page asks for; answers with the address of the page that follows it."""
-    asked = await fields_of(request)
+    fields = await fields_of(request)
     pages = pages_of(request)
-    kind = asked.get("what", "")
+    kind = fields.get("what", "")
     if kind not in KINDS:
         raise ProcessError(f"{kind!r} cannot be started; there are {', '.join(KINDS)}")
-    job = await run_in_threadpool(KINDS[kind], pages.library, jobs_of(request), asked)
+    job = await run_in_threadpool(KINDS[kind], pages.library, jobs_of(request), fields)
     return JSONResponse({"address": pages.address("job", name=job.name)})
 
 
@@ -61,8 +61,8 @@ def _campaign(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
 
 def campaign_files(library: Library) -> dict[str, Path]:
     """Campaign files that can be started, by the name that a page shows: those of the folder, and the examples."""
-    own = [path for path in library.yaml_files("kind: campaign") if path.name != PLAN]
-    return {library.name(path): path for path in own} | {
+    paths = [path for path in library.yaml_files("kind: campaign") if path.name != PLAN]
+    return {library.name(path): path for path in paths} | {
         f"example: {path.stem}": path for path in sorted((CONFIGS / "campaigns").glob("*.yaml"))
     }
 
@@ -82,10 +82,10 @@ def _resume(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
 
 def resume_command(folder: Path) -> list[str] | None:
     """The command that resumes the campaign in a folder, with the user's own files; None where it is not theirs."""
-    own = own_campaign(folder)
-    if own is None:
+    files = own_campaign(folder)
+    if files is None:
         return None
-    campaign, rig = own
+    campaign, rig = files
     # A folder that is the second of its name is found by the same command with --as-new.
     more = [] if folder.name == Campaign.load(campaign).name else ["--as-new"]
     return ["acquire", "--campaign", str(campaign), "--rig", str(rig), "--out", str(folder.parent), *more]
@@ -104,7 +104,7 @@ def resumed_with(folder: Path) -> tuple[str, list[str]] | None:
     except ProcessError:
         return None
     named = [rig.alert, rig.notify.command if rig.notify else (), (rig.notify and rig.notify.webhook) or ""]
-    return shlex.join(command), [one if isinstance(one, str) else shlex.join(one) for one in named if one]
+    return shlex.join(command), [entry if isinstance(entry, str) else shlex.join(entry) for entry in named if entry]
 
 
 def _reduce(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
@@ -155,8 +155,8 @@ def instrument_files(library: Library) -> dict[str, Path]:
 
 def material_files(library: Library) -> dict[str, Path]:
     """Material files, as `instrument_files`."""
-    own = [path for kind in kinds() for path in library.yaml_files(f"kind: {kind}")]
-    return _with_examples(library, own, "materials")
+    paths = [path for kind in kinds() for path in library.yaml_files(f"kind: {kind}")]
+    return _with_examples(library, paths, "materials")
 
 
 def geometry_files(library: Library) -> dict[str, Path]:
@@ -194,8 +194,8 @@ KINDS: dict[str, Callable[[Library, Jobs, dict[str, str]], PageJob]] = {
 def job(request: Request) -> HTMLResponse:
     """The page of a job."""
     pages, jobs = pages_of(request), jobs_of(request)
-    found = jobs.job(request.query_params.get("name", ""))
-    return pages.draw("job.html", simulated=_simulated(pages, found), job=found, now=told(pages, jobs, found))
+    page_job = jobs.job(request.query_params.get("name", ""))
+    return pages.draw("job.html", simulated=_simulated(pages, page_job), job=page_job, now=told(pages, jobs, page_job))
 
 
 def _simulated(pages: Pages, found: PageJob) -> bool:
@@ -221,8 +221,8 @@ def told(pages: Pages, jobs: Jobs, found: PageJob) -> dict[str, Any]:
     if "file" in about:
         entry = library.entry(about["file"])
         if status == "done" and "diagnosis" not in about:
-            made = [e for e in library.entries() if e.changed_s >= found.begun_s and e.kind != "capture"]
-            links += [[f"{e.kind}: {e.name}", link] for e in made if (link := pages.shown_at(e)) is not None]
+            products = [e for e in library.entries() if e.changed_s >= found.begun_s and e.kind != "capture"]
+            links += [[f"{e.kind}: {e.name}", link] for e in products if (link := pages.shown_at(e)) is not None]
         links.append([entry.name, pages.shown_at(entry) or pages.address("")])
     return {"status": status, "output": jobs.output(found), "links": links}
 
@@ -230,14 +230,14 @@ def told(pages: Pages, jobs: Jobs, found: PageJob) -> dict[str, Any]:
 async def job_events(request: Request) -> StreamingResponse:
     """Server-sent events: output and status of a job, until it has ended."""
     pages, jobs = pages_of(request), jobs_of(request)
-    found = jobs.job(request.query_params.get("name", ""))
+    page_job = jobs.job(request.query_params.get("name", ""))
     return event_stream(
-        request, lambda: told(pages, jobs, found), lambda now: now["status"] not in ("running", "ended")
+        request, lambda: told(pages, jobs, page_job), lambda now: now["status"] not in ("running", "ended")
     )
 
 
 async def stop_job(request: Request) -> JSONResponse:
     """Send a job what Ctrl-C sends."""
-    asked, jobs = await fields_of(request), jobs_of(request)
-    jobs.stop(jobs.job(asked.get("name", "")))
+    fields, jobs = await fields_of(request), jobs_of(request)
+    jobs.stop(jobs.job(fields.get("name", "")))
     return JSONResponse({"stopping": True})

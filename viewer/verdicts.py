@@ -30,12 +30,12 @@ def diagnosis(request: Request) -> HTMLResponse:
     name = request.query_params.get("name", "")
     story = diagnoses.story(name)
     residuals = diagnoses.residuals(name)
-    found = story.diagnosis
+    result = story.diagnosis
     return pages.draw(
         "diagnosis.html",
-        simulated=found.simulated,
+        simulated=result.simulated,
         story=story,
-        found=found,
+        found=result,
         proposed=_free_name(pages.library.root, story.model),
         captures=[(capture, pages.address("capture", file=capture)) for capture in story.captures],
         look={"captures": [_told(residual) for residual in residuals]},
@@ -54,14 +54,14 @@ def _free_name(folder: Path, model: str) -> str:
 def _told(residual: StoredResidual) -> dict[str, Any]:
     rows, columns = residual.images["before"].shape[-2:]
     loud = [_rms(residual, moment) for moment in MOMENTS]
-    known = np.concatenate([image[np.isfinite(image)] for image in loud])
+    valid = np.concatenate([image[np.isfinite(image)] for image in loud])
     return {
         "name": residual.name,
         "shape": [rows, columns],
         "per_state": {moment: finite(values) for moment, values in residual.per_state.items()},
         "harmonics": residual.harmonics,
         # Before and after on one scale, or they could not be compared.
-        "loudest": float(np.percentile(known, 99.5)) if known.size else 1.0,
+        "loudest": float(np.percentile(valid, 99.5)) if valid.size else 1.0,
     }
 
 
@@ -90,13 +90,13 @@ def residual_curve(request: Request) -> JSONResponse:
     """Residual of each state, before and after, mean over a pixel or a region in units of the noise of that mean."""
     residual = _chosen(request)
     region = Region.asked(request.query_params, residual.images["before"].shape[-2:])
-    told: dict[str, Any] = {"where": str(region)}
+    curves: dict[str, Any] = {"where": str(region)}
     for moment in MOMENTS:
         part = residual.images[moment][:, region.rows, region.columns].astype(float).reshape(-1, region.pixels)
         with np.errstate(invalid="ignore"):
             used = np.isfinite(part).sum(axis=1)
-            told[moment] = finite(np.nansum(part, axis=1) / np.sqrt(np.where(used > 0, used, np.nan)))
-    return JSONResponse(told)
+            curves[moment] = finite(np.nansum(part, axis=1) / np.sqrt(np.where(used > 0, used, np.nan)))
+    return JSONResponse(curves)
 
 
 def _chosen(request: Request) -> StoredResidual:
@@ -109,10 +109,10 @@ def _chosen(request: Request) -> StoredResidual:
 
 async def decide(request: Request) -> JSONResponse:
     """Accept the corrected model, which writes new files, or reject it; both with a note."""
-    asked, diagnoses = await fields_of(request), diagnoses_of(request)
-    name, note = asked.get("name", ""), asked.get("note", "")
-    if asked.get("accept"):
-        written = await run_in_threadpool(diagnoses.accept, name, asked.get("file", ""), note)
+    fields, diagnoses = await fields_of(request), diagnoses_of(request)
+    name, note = fields.get("name", ""), fields.get("note", "")
+    if fields.get("accept"):
+        written = await run_in_threadpool(diagnoses.accept, name, fields.get("file", ""), note)
         return JSONResponse({"files": [path.name for path in written]})
     diagnoses.reject(name, note)
     return JSONResponse({"files": []})

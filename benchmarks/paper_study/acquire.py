@@ -55,10 +55,10 @@ class Part:
 
 def parts(size: Size) -> tuple[Part, ...]:
     """The sphere at all angles, the body, and the sphere again after somebody remounted a plate."""
-    both = ("drr", "stokes")
+    modes = ("drr", "stokes")
     return (
-        Part("sphere", "sphere", both, size.omega_deg),
-        Part("body", "body", both, (SHOWN_DEG,)),
+        Part("sphere", "sphere", modes, size.omega_deg),
+        Part("body", "body", modes, (SHOWN_DEG,)),
         Part("fault", "sphere", ("drr",), size.fault_deg, (FAULT,), air=True),
     )
 

@@ -37,8 +37,8 @@ def budget(study: SphereStudy, nm: float, quantity: str) -> Budget:
     total, registered, true_material = (_mean_square(run, nm, quantity) for run in runs)
     noises = [_mean_square(run, nm, NOISE[quantity]) for run in runs]
     # The noise differs a little between the runs: other pixels count.
-    told, found, right = (a - b for a, b in zip((total, registered, true_material), noises, strict=True))
-    return Budget(total, noises[0], told - found, found - right, right)
+    nominal, aligned, ideal = (a - b for a, b in zip((total, registered, true_material), noises, strict=True))
+    return Budget(total, noises[0], nominal - aligned, aligned - ideal, ideal)
 
 
 def signed_root(square: float) -> float:

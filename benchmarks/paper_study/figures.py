@@ -87,7 +87,7 @@ def dominant(product: Path, geometry: Path, material: Path) -> Dominant:
 def dominant_images(name: str, images: Mapping[float, Dominant]) -> Shown:
     """Mueller images of the measured and the modelled dominant process."""
     matrices = {
-        f"{what}, {nm:g} nm": getattr(found, what) for nm, found in images.items() for what in ("measured", "modelled")
+        f"{part}, {nm:g} nm": getattr(image, part) for nm, image in images.items() for part in ("measured", "modelled")
     }
     return Shown(_tiled(matrices), f"Dominant process of the {name}, its m00 = 1 (paper, Fig. 6). {FRAMES}")
 
@@ -95,10 +95,10 @@ def dominant_images(name: str, images: Mapping[float, Dominant]) -> Shown:
 def orientation(images: Mapping[float, Dominant]) -> Shown:
     """psi measured, modelled, and how far they are apart."""
     panels: Panels = []
-    for nm, found in images.items():
-        for what in ("measured", "modelled"):
-            panels.append((rf"$\psi$ {what}, {nm:g} nm / degrees", _psi(getattr(found, what)), CYCLIC))
-        a, b = (linear_diattenuation(m) for m in (found.modelled, found.measured))
+    for nm, image in images.items():
+        for part in ("measured", "modelled"):
+            panels.append((rf"$\psi$ {part}, {nm:g} nm / degrees", _psi(getattr(image, part)), CYCLIC))
+        a, b = (linear_diattenuation(m) for m in (image.modelled, image.measured))
         off = np.abs(np.rad2deg(orientation_difference(a, b)))
         panels.append((rf"deviation, {nm:g} nm / degrees", off, {"cmap": "magma", "vmin": 0, "vmax": 45}))
     caption = "Orientation psi of the diattenuation of the dominant process (paper, Fig. 7), with its noise."
@@ -108,11 +108,11 @@ def orientation(images: Mapping[float, Dominant]) -> Shown:
 def diattenuation(images: Mapping[float, Dominant]) -> Shown:
     """|D| measured, modelled and the difference."""
     panels: Panels = []
-    for nm, found in images.items():
-        for what in ("measured", "modelled"):
-            d = magnitude(linear_diattenuation(getattr(found, what)))
-            panels.append((f"$|D|$ {what}, {nm:g} nm", d, {"vmin": 0, "vmax": 1}))
-        a, b = (magnitude(linear_diattenuation(m)) for m in (found.modelled, found.measured))
+    for nm, image in images.items():
+        for part in ("measured", "modelled"):
+            d = magnitude(linear_diattenuation(getattr(image, part)))
+            panels.append((f"$|D|$ {part}, {nm:g} nm", d, {"vmin": 0, "vmax": 1}))
+        a, b = (magnitude(linear_diattenuation(m)) for m in (image.modelled, image.measured))
         panels.append((f"modelled - measured, {nm:g} nm", a - b, {"cmap": "RdBu_r", "vmin": -0.3, "vmax": 0.3}))
     caption = (
         "Magnitude of the diattenuation of the dominant process (paper, Fig. 8). At 662 nm there are two neutral "
@@ -178,8 +178,8 @@ def polarizer_pairs(body: Mapping[float, BodyProducts]) -> Shown:
             lit = (measured.get("lit") > 0) & np.isfinite(extrapolated.get("crossed_linear"))
             for name in PAPER_PAIRS:
                 pair = [np.where(lit, product.get(name), np.nan) for product in (measured, extrapolated)]
-                both = np.concatenate([image[lit] for image in pair])
-                low, high = (float(np.percentile(both, p)) for p in (1, 99)) if both.size else (0.0, 1.0)
+                values = np.concatenate([image[lit] for image in pair])
+                low, high = (float(np.percentile(values, p)) for p in (1, 99)) if values.size else (0.0, 1.0)
                 label = f"{name.replace('_', ' ')}, {nm:g} nm: correlation {_correlation(*pair):.2f}"
                 cut = _object_only(pair)
                 beside = np.concatenate([pair[0][cut], _gap(pair[0][cut], axis=1), pair[1][cut]], axis=1)
@@ -194,8 +194,8 @@ def polarizer_pairs(body: Mapping[float, BodyProducts]) -> Shown:
 def fault_images(before: Dominant, after: Dominant, nm: float) -> Shown:
     """Deviation of psi before and after the correction."""
     panels: Panels = []
-    for name, found in (("before", before), ("after", after)):
-        a, b = (linear_diattenuation(m) for m in (found.modelled, found.measured))
+    for name, image in (("before", before), ("after", after)):
+        a, b = (linear_diattenuation(m) for m in (image.modelled, image.measured))
         off = np.rad2deg(orientation_difference(b, a))
         panels.append((rf"$\psi$ measured - model, {name} / degrees", off, {"cmap": "RdBu_r", "vmin": -10, "vmax": 10}))
     return Shown(_grid(panels, 2), f"Deviation of psi with the undeclared fault, and after `diagnose`, {nm:g} nm.")
@@ -216,8 +216,8 @@ def _grid(panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], columns: i
 
 def _object_only(images: Sequence[NDArray[Any]]) -> tuple[slice, slice]:
     """The part of the frame that any of the images has something in."""
-    known = np.any([np.isfinite(image) for image in images], axis=0)
-    rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
+    valid = np.any([np.isfinite(image) for image in images], axis=0)
+    rows, columns = (np.flatnonzero(valid.any(axis=axis)) for axis in (1, 0))
     if not rows.size:
         return slice(None), slice(None)
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
@@ -250,7 +250,7 @@ def _psi(m: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def _correlation(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    both = np.isfinite(a) & np.isfinite(b)
+    valid = np.isfinite(a) & np.isfinite(b)
     # A few pixels at the outline are far off and would decide alone.
-    keep = both & (a < percentile(a, 99.5)) & (b < percentile(b, 99.5))
+    keep = valid & (a < percentile(a, 99.5)) & (b < percentile(b, 99.5))
     return float(np.corrcoef(a[keep], b[keep])[0, 1]) if keep.sum() > 2 else float("nan")

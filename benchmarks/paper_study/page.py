@@ -64,9 +64,9 @@ def write_page(
         _budget(sphere, wavelengths),
         _fault(fault, wavelengths),
     ]
-    made = f"Made by umov {version('umov')}, `./lab paper`, on {datetime.now(UTC).isoformat(timespec='seconds')}."
+    stamp = f"Made by umov {version('umov')}, `./lab paper`, on {datetime.now(UTC).isoformat(timespec='seconds')}."
     title = "Efficient Modeling of Depolarizing Mueller BRDFs: the study on emulated instruments"
-    out.write_text(render(title, True, made, sections), encoding="utf-8")
+    out.write_text(render(title, True, stamp, sections), encoding="utf-8")
 
 
 def _section(
@@ -141,17 +141,17 @@ def _tables(sphere: SphereStudy, wavelengths: Sequence[float], pixels: int) -> R
 
 
 def _materials(sphere: SphereStudy, wavelengths: Sequence[float]) -> ReportSection:
-    told, true = load_reflectance(TABLE_I), load_reflectance(TRUE_MATERIAL)
+    declared, true = load_reflectance(TABLE_I), load_reflectance(TRUE_MATERIAL)
     rows = [["", "n", "k", "a", "b", "reduced chi-square", "pixels"]]
     for nm in wavelengths:
-        for who, material in (("paper, Table I", told), ("the bench, not told", true)):
+        for who, material in (("paper, Table I", declared), ("the bench, not told", true)):
             c = material.constants[nm]
             rows.append([f"{nm:g} nm, {who}", f"{c.n:g}", f"{c.k:g}", f"{c.a:g}", f"{c.b:g}", "", ""])
         for images, fitted in sphere.fits[nm].items():
             fit = fitted.fit
             cells = [
-                f"{value:.3f} ± {error:.3f}" if known else "not determined"
-                for value, error, known in zip(fit.constants, fit.stderr, fit.identified.values(), strict=True)
+                f"{value:.3f} ± {error:.3f}" if is_determined else "not determined"
+                for value, error, is_determined in zip(fit.constants, fit.stderr, fit.identified.values(), strict=True)
             ]
             rows.append([f"{nm:g} nm, {images}", *cells, f"{fit.chi_square:.3g}", f"{fit.pixels}"])
     note = (
@@ -168,8 +168,8 @@ def _budget(sphere: SphereStudy, wavelengths: Sequence[float]) -> ReportSection:
     rows = [head]
     for nm in wavelengths:
         for name in QUANTITIES:
-            found = budget(sphere, nm, name)
-            squares = (found.total, found.noise, found.registration, found.material, found.rest)
+            shares = budget(sphere, nm, name)
+            squares = (shares.total, shares.noise, shares.registration, shares.material, shares.rest)
             rows.append([f"{nm:g} nm, {LABELS[name]}", *(f"{signed_root(square):.2f}" for square in squares)])
     note = (
         "contributions as roots of mean squares over Omega; they add as squares. Noise: what the captures' error bars "
@@ -181,12 +181,12 @@ def _budget(sphere: SphereStudy, wavelengths: Sequence[float]) -> ReportSection:
 
 
 def _fault(fault: FaultStudy, wavelengths: Sequence[float]) -> ReportSection:
-    found = []
+    effects = []
     for effect in fault.found.effects:
         values = ", ".join(f"{name} {value.told} {value.unit}" for name, value in effect.parameters.items())
-        found.append((f"found: {effect.kind}", values))
-    told = f"{FAULT['parameter']} of {FAULT['element']} is {FAULT['offset']:g} degrees off, which no file says"
-    summary = [("the fault", told), ("diagnose", f"{fault.found.verdict}. {fault.found.recommendation}"), *found]
+        effects.append((f"found: {effect.kind}", values))
+    text = f"{FAULT['parameter']} of {FAULT['element']} is {FAULT['offset']:g} degrees off, which no file says"
+    summary = [("the fault", text), ("diagnose", f"{fault.found.verdict}. {fault.found.recommendation}"), *effects]
     rows = [["", "Omega", *(f"{LABELS[name]}, {when}" for name in QUANTITIES for when in ("before", "after"))]]
     for before, after in zip(fault.before.rows, fault.after.rows, strict=True):
         key = (before.wavelength_nm, before.omega_deg)

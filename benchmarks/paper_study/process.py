@@ -91,11 +91,11 @@ def study_sphere(captures: Path, out: Path, pool: Executor, say: Say) -> SphereS
 
 def study_body(captures: Path) -> dict[float, BodyProducts]:
     """Mueller image, eigenvalues, extrapolation and polarizer pairs of the body, by wavelength."""
-    found: dict[float, dict[str, Path]] = {}
+    images: dict[float, dict[str, Path]] = {}
     for path, kind, nm, *_ in find_captures(captures)[0]:
-        found.setdefault(nm, {})[kind] = reduced(path).path
+        images.setdefault(nm, {})[kind] = reduced(path).path
     products = {}
-    for nm, image in found.items():
+    for nm, image in images.items():
         extrapolation = Extrapolation(image["stokes"], BODY, TABLE_I).found_or_made().path
         products[nm] = BodyProducts(
             mueller=image["mueller"],
@@ -114,11 +114,11 @@ def study_fault(captures: Path, out: Path, healthy: SphereStudy, pool: Executor,
     say("sphere with the undeclared fault")
     before = ProcessedCampaign(captures, out / "before", SPHERE, TABLE_I).run(pool)
     say("diagnose")
-    found, instrument = _diagnosed(captures, out)
+    diagnosis, instrument = _diagnosed(captures, out)
     say("sphere, corrected")
     after = ProcessedCampaign(captures, out / "after", SPHERE, TABLE_I, instrument=instrument).run(pool)
     xi0 = {name: _xi0(result, healthy) for name, result in (("before", before), ("after", after))}
-    return FaultStudy(before, after, found, xi0)
+    return FaultStudy(before, after, diagnosis, xi0)
 
 
 def _diagnosed(captures: Path, out: Path) -> tuple[Diagnosis, Path]:
@@ -140,7 +140,7 @@ def _xi0(faulty: CampaignResult, healthy: SphereStudy) -> dict[tuple[float, floa
     """RMSD of xi0, %, of the faulty Mueller polarimeter against the sound Stokes camera, by wavelength and Omega."""
     stokes = healthy.as_told.tables
     shape = _shape(healthy.folder)
-    found = {}
+    rmsd = {}
     for row in faulty.rows:
         tables = [
             ScatteringTable.load(path)
@@ -148,8 +148,8 @@ def _xi0(faulty: CampaignResult, healthy: SphereStudy) -> dict[tuple[float, floa
         ]
         view = healthy.as_told.views["stokes"]
         compared = compare_on_sphere(tables[0], tables[1], view, row.omega_deg, shape=shape)
-        found[row.wavelength_nm, row.omega_deg] = compared.get("xi0_percent", float("nan"))
-    return found
+        rmsd[row.wavelength_nm, row.omega_deg] = compared.get("xi0_percent", float("nan"))
+    return rmsd
 
 
 def _shape(folder: Path) -> tuple[int, int]:
@@ -168,8 +168,8 @@ def _fits(captures: Path, products: Path, geometries: Mapping[str, Path]) -> dic
         # Of Mueller images both ways that the paper's conclusions propose; Stokes images allow the second alone.
         for correlation in (False, True) if kind == "mueller" else (False,):
             fitting = MaterialFitting(sources, geometries[kind], "fitted red print", correlation)
-            found = fitting.fitted()
-            fits.setdefault(nm, {})[f"{kind} images by the {found.fit.method}"] = found
+            material = fitting.fitted()
+            fits.setdefault(nm, {})[f"{kind} images by the {material.fit.method}"] = material
     return fits
 
 
