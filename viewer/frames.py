@@ -2,11 +2,11 @@
 
 from typing import Any
 
-import cv2
 import numpy as np
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
+from processing.computing.png import png
 from processing.errors import ProcessError
 from processing.reduction.counts_to_signal import saturation
 from processing.reports.capture_facts import facts_of, papers_of
@@ -22,7 +22,7 @@ from viewer.starting import geometry_files, instrument_files, material_files
 BARS = 256
 #: Longest side of a preview, pixels.
 PREVIEW = 480
-RED_BGR = (45, 18, 227)
+RED = (227, 18, 45)
 
 
 def capture(request: Request) -> HTMLResponse:
@@ -123,9 +123,8 @@ def preview(request: Request) -> Response:
     grey = np.nan_to_num(np.clip((mean - black) / max(high - black, 1.0), 0, 1)) * 255
     picture = np.repeat(grey.astype(np.uint8)[..., np.newaxis], 3, axis=2)
     if top is not None:
-        picture[window.largest(counts) >= top] = RED_BGR
-    png = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
-    return Response(png, media_type="image/png")
+        picture[window.largest(counts) >= top] = RED
+    return Response(png(picture), media_type="image/png")
 
 
 def chosen(opened: Capture, query: Any) -> tuple[int, int]:

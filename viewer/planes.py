@@ -5,7 +5,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from starlette.responses import Response
@@ -64,15 +63,20 @@ class Window:
         part = np.ascontiguousarray(image[:, self.columns], dtype=np.float32)
         if self.step == 1:
             return part
-        return np.asarray(cv2.blur(part, (self.step, self.step), anchor=(0, 0))[:: self.step, :: self.step])
+        pixels = (np.diff([*range(0, size, self.step), size]).astype(np.float32) for size in part.shape)
+        return np.asarray(self._blocks(np.add, part) / np.outer(*pixels))
 
     def largest(self, image: NDArray[Any]) -> NDArray[Any]:
         """The largest of each block of step x step pixels: a single saturated pixel shows however far one is away."""
         part = np.ascontiguousarray(image[:, self.columns])
         if self.step == 1:
             return part
-        block = np.ones((self.step, self.step), np.uint8)
-        return np.asarray(cv2.dilate(part, block, anchor=(0, 0))[:: self.step, :: self.step])
+        return self._blocks(np.maximum, part)
+
+    def _blocks(self, whole: np.ufunc, part: NDArray[Any]) -> NDArray[Any]:
+        for axis in (0, 1):
+            part = whole.reduceat(part, range(0, part.shape[axis], self.step), axis=axis)
+        return part
 
 
 def _inside(first: float, last: float, length: int) -> slice:

@@ -5,9 +5,10 @@ all. Where a plan comes back to its first pose (`repeat_first`), the two frames 
 not what: `diagnose` tells a slipped element from a lamp that drifts.
 """
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from processing.computing.filters import block_means
 
 #: Noise is averaged over so many blocks a side, each of so many pixels a side at least; those with less light than this
 #: part of the brightest are left out.
@@ -64,5 +65,4 @@ class RepeatedState:
 
     def _means(self, frame: NDArray[np.generic]) -> NDArray[np.float64]:
         rows, columns = (max(1, min(BLOCKS, size // BLOCK_PIXELS)) for size in frame.shape)
-        means = cv2.resize(np.asarray(frame, dtype=np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
-        return np.asarray(means, dtype=float) - self._black
+        return block_means(frame, rows, columns) - self._black

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import typer
 from numpy.typing import NDArray
@@ -78,5 +77,9 @@ def _write(out: Path, pixels: NDArray[np.uint16], black: float) -> None:
     if out.suffix.lower() == PICTURE:
         top = max(float(np.percentile(pixels, 99.8)), black + 1)
         shown = np.clip((pixels.astype(np.float32) - black) / (top - black) * 255, 0, 255).astype(np.uint8)
-    if not cv2.imwrite(str(out), shown):
-        raise AcquisitionError(f"{out} cannot be written. Check that its folder exists and that the disc has space.")
+    from PIL import Image
+
+    try:
+        Image.fromarray(shown).save(out)
+    except OSError as error:
+        raise AcquisitionError(f"{out} cannot be written ({error.strerror or error}).") from error

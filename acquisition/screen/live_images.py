@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from acquisition.screen.observer import Mosaic
+from processing.computing.png import png
 
 #: Longest side of a picture on the page.
 LARGEST = 480
@@ -19,11 +19,11 @@ def last_frame_png(pixels: NDArray[np.uint16], black: float, full_scale: int) ->
     tones = (np.sqrt(np.clip((counts - black) / (full_scale - black), 0, 1)) * 255).astype(np.uint8)
     grey = tones[np.minimum(thinned(pixels), full_scale)]
     if int(pixels.max()) < full_scale:
-        return _png(grey)
+        return png(grey)
     image = np.repeat(grey[..., np.newaxis], 3, axis=2)
     # A saturated pixel must show even where thinning left it out.
-    image[_thin_largest(pixels)[: image.shape[0], : image.shape[1]] >= full_scale] = (40, 40, 255)
-    return _png(image)
+    image[_thin_largest(pixels)[: image.shape[0], : image.shape[1]] >= full_scale] = (255, 40, 40)
+    return png(image)
 
 
 class Modulation:
@@ -69,10 +69,12 @@ def dolp_png(pixels: NDArray[np.uint16], mosaic: Mosaic, black: float) -> bytes:
 
 
 def _map_png(values: NDArray[np.floating], light: NDArray[np.floating]) -> bytes:
+    from matplotlib import colormaps
+
     # Where there is hardly any light, noise alone would look like full polarization.
     lit = light > 0.02 * float(np.percentile(light, 99.5))
     shown = np.where(lit, np.clip(values, 0, 1), 0)
-    return _png(np.asarray(cv2.applyColorMap((shown * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS), dtype=np.uint8))
+    return png(colormaps["viridis"]((shown * 255).astype(np.uint8), bytes=True)[..., :3])
 
 
 def histogram(pixels: NDArray[np.uint16], full_scale: int) -> list[int]:
@@ -99,10 +101,3 @@ def _thin_largest(pixels: NDArray[np.uint16]) -> NDArray[np.uint16]:
     padded[: pixels.shape[0], : pixels.shape[1]] = pixels
     blocks = padded.reshape(rows // step, step, columns // step, step)
     return np.asarray(blocks.max(axis=(1, 3)))
-
-
-def _png(image: NDArray[np.uint8]) -> bytes:
-    done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    if not done:
-        raise ValueError("the picture could not be encoded")
-    return data.tobytes()

@@ -3,15 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.doors import require_picture
+from processing.extras import needed
 from processing.geometry.errors import GeometryError, OutlineNotFound
 from processing.geometry.pinhole import PinholeCamera
 
+cv2 = needed("cv2", "fast")
 DICTIONARIES = ("DICT_4X4_50", "DICT_4X4_100", "DICT_5X5_100", "DICT_6X6_250")
 
 
@@ -25,7 +27,7 @@ class Board:
     marker_mm: float
     dictionary: str = "DICT_4X4_50"
 
-    def opencv(self) -> cv2.aruco.CharucoBoard:
+    def opencv(self) -> Any:
         """The board as OpenCV knows it. Raises GeometryError for one that cannot be."""
         if self.dictionary not in DICTIONARIES:
             raise GeometryError(f"no marker dictionary {self.dictionary!r}; there are: {', '.join(DICTIONARIES)}")

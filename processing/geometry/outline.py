@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import binary_erosion, binary_fill_holes, label, map_coordinates, maximum_filter
 from scipy.optimize import least_squares
 
 from processing.arrays import Array
+from processing.computing.filters import gaussian
 from processing.geometry.errors import OutlineNotFound
 from processing.geometry.sphere import Sphere
 from processing.geometry.viewing import ViewingGeometry
@@ -57,7 +57,7 @@ def find_sphere(image: ArrayLike, seed: int = 0) -> Circle:
     """
     img = np.nan_to_num(np.asarray(image, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0)
     contour, inside = _bright_contour(img)
-    smooth = cv2.GaussianBlur(img, (0, 0), 1.0)
+    smooth = gaussian(img, 1.0)
     start = _consensus(_sharp(contour, smooth), inside, np.random.default_rng(seed))
     circle = start
     for _ in range(3):
@@ -128,33 +128,38 @@ def _check_frame(circle: Array, shape: tuple[int, ...]) -> None:
         )
 
 
-def _bright_contour(img: Array) -> tuple[Array, NDArray[np.uint8]]:
+def _bright_contour(img: Array) -> tuple[Array, NDArray[np.bool_]]:
     top = float(np.percentile(img, 99.5))
     if top <= 0 or not np.isfinite(top):
         raise OutlineNotFound("the image is dark everywhere: there is no sphere to find")
-    scaled = np.clip(img / top * 255, 0, 255).astype(np.uint8)
-    scaled = cv2.GaussianBlur(scaled, (0, 0), 1.5)
-    _, bright = cv2.threshold(scaled, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(bright)
-    if count < 2:
+    grey = np.rint(gaussian(np.clip(img / top * 255, 0, 255), 1.5)).astype(np.uint8)
+    labels, count = label(grey > _otsu(grey), np.ones((3, 3)))
+    if not count:
         raise OutlineNotFound("the image has no bright object before a darker background")
-    largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-    mask = (labels == largest).astype(np.uint8)
+    mask = labels == 1 + np.argmax(np.bincount(labels.reshape(-1))[1:])
     if mask.sum() < 100:
         raise OutlineNotFound(f"the largest bright object covers {int(mask.sum())} pixels, too few for an outline")
-    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    xy = max(contours, key=len)[:, 0, :]
-    return xy[:, ::-1].astype(float), mask
+    whole = binary_fill_holes(mask)
+    return np.argwhere(whole & ~binary_erosion(whole)).astype(float), mask
+
+
+def _otsu(grey: NDArray[np.uint8]) -> int:
+    """The grey value up to which pixels are dark: the two classes then differ most."""
+    share = np.bincount(grey.reshape(-1), minlength=256) / grey.size
+    dark, level = np.cumsum(share), np.cumsum(share * np.arange(256))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = (level[-1] * dark - level) ** 2 / (dark * (1 - dark))
+    return int(np.argmax(np.nan_to_num(between, nan=0.0, posinf=0.0)))
 
 
 def _sharp(contour: Array, smooth: Array) -> Array:
     # The border of the shadow falls off over the whole radius, the limb within two pixels.
-    slope = cv2.dilate(np.hypot(*np.gradient(smooth)), np.ones((7, 7)))
+    slope = maximum_filter(np.hypot(*np.gradient(smooth)), 7)
     steepness = slope[contour[:, 0].astype(int), contour[:, 1].astype(int)]
     return np.asarray(contour[steepness > 0.3 * np.percentile(steepness, 95)])
 
 
-def _consensus(contour: Array, mask: NDArray[np.uint8], rng: np.random.Generator) -> Array:
+def _consensus(contour: Array, mask: NDArray[np.bool_], rng: np.random.Generator) -> Array:
     # A circle through three points of the contour, best supported, that holds nearly all of the object.
     best, support = None, 0
     area = np.argwhere(mask)[:: max(1, int(mask.sum()) // 2000)]

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_erosion, distance_transform_edt, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from processing.arrays import Array
+from processing.computing.filters import gaussian
 from processing.geometry.errors import OutlineNotFound
 from processing.geometry.frames import unit
 from processing.geometry.mesh import Mesh
@@ -93,7 +93,7 @@ def _signed_distance(mask: NDArray[np.bool_]) -> Array:
     # Positive outside; the border runs half way between a pixel inside and one outside.
     inside, outside = distance_transform_edt(mask), distance_transform_edt(~mask)
     signed = np.where(mask, 0.5 - inside, outside - 0.5)
-    return np.asarray(cv2.GaussianBlur(signed, (0, 0), 1.0))
+    return np.asarray(gaussian(signed, 1.0))
 
 
 def _rim(mesh: Mesh, camera: PinholeCamera, seen: NDArray[np.bool_]) -> tuple[Array, Array, float]:

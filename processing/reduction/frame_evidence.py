@@ -10,11 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
+from processing.computing.filters import block_means
 from processing.storage.captures.capture import Capture
 
 #: Every so many-th row is compared; noise makes each row unlike any other.
@@ -128,8 +128,8 @@ class FrameEvidence:
             found.append(FrameFinding(state, "time", text))
         self._last = state, number, camera_ns
         if light and self._rows is not None:
-            means = cv2.resize(np.asarray(pixels, dtype=np.float32), (BLOCKS, BLOCKS), interpolation=cv2.INTER_AREA)
-            self._blocks[state] = (means.astype(float) - self._black) / exposure_s
+            means = block_means(pixels, BLOCKS, BLOCKS)
+            self._blocks[state] = (means - self._black) / exposure_s
         # A clock that stands does so in every state from then on.
         found = [finding for finding in found if finding.kind not in {earlier.kind for earlier in self.found}]
         self.found += found

@@ -2,10 +2,11 @@
 
 import math
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+
+from processing.computing.filters import separable
 
 #: Pixels on either side that count; what the spline takes from further away is below 1e-4.
 REACH = 10
@@ -20,7 +21,7 @@ def shifted_back(image: NDArray[np.floating], x_px: float, y_px: float, blur_px2
     along_x, along_y = (np.convolve(taps(shift), sharper) if blur_px2 else taps(shift) for shift in (x_px, y_px))
     x, y = along_x.size // 2, along_y.size // 2
     wide = np.pad(image.astype(np.float32), ((y, y), (x, x)), mode="reflect", reflect_type="odd")
-    moved = cv2.sepFilter2D(wide, -1, along_x, along_y)
+    moved = separable(wide, along_x, along_y)
     return np.asarray(moved[y : y + image.shape[0], x : x + image.shape[1]], dtype=np.float32)
 
 

@@ -274,12 +274,12 @@ def _spread(mask: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8
         return np.asarray(mask[0::2, 0::2] | mask[0::2, 1::2] | mask[1::2, 0::2] | mask[1::2, 1::2])
     if not mask.any():
         return mask
-    import cv2
+    from scipy.ndimage import maximum_filter
 
     out = np.zeros_like(mask)
     for flag in Mask:
         bit = np.uint8(flag)
-        out |= cv2.dilate((mask & bit), np.ones((3, 3), np.uint8)) & bit
+        out |= maximum_filter(mask & bit, 3)
     return out
 
 

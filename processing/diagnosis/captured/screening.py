@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from scipy import ndimage
 
 from processing.arrays import Array
+from processing.computing.filters import separable
 from processing.diagnosis.captured.averaged import averaged_for_fits
 from processing.diagnosis.captured.capture_data import CaptureData, LeftOut
 from processing.diagnosis.captured.noise import checked_noise, estimated_noise
@@ -60,8 +60,7 @@ def _lost_by_moving(data: CaptureData) -> Array:
     total, alone = np.zeros(frames.shape[1:]), np.ones(1)
     for image, s, f in zip(frames, slope, floor, strict=True):
         square = sum(
-            cv2.sepFilter2D(image, cv2.CV_32F, across, down, borderType=cv2.BORDER_REFLECT) ** 2
-            for across, down in ((change, alone), (alone, change))
+            separable(image, across, down, "reflect") ** 2 for across, down in ((change, alone), (alone, change))
         )
         total += square / (s * np.maximum(image, 0) + f)
     return np.asarray(total / len(frames) - 2 * np.sum(change**2))

@@ -8,11 +8,11 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
+from processing.computing.filters import separable
 from processing.diagnosis.captured.capture_data import SharedNoise
 from processing.instrument.changes import STRAIGHT_BELOW
 from processing.reduction.move_image import noise_taps
@@ -90,7 +90,7 @@ def derivatives_of_part(u: NDArray[np.floating], rows: slice, columns: slice) ->
     inner = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
     for n, frame in enumerate(u[:, top : rows.stop + MARGIN, left : columns.stop + MARGIN]):
         for k, (down, right) in enumerate(ORDERS):
-            out[k, n] = cv2.sepFilter2D(frame, -1, FILTERS[right], FILTERS[down])[inner]
+            out[k, n] = separable(frame, FILTERS[right], FILTERS[down])[inner]
     return out
 
 

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.doors import MOST_PIXELS, one_line, require_file, require_picture
+from processing.errors import ProcessError
+from processing.extras import needed
 from processing.storage.formats.axostep import read_rmmd
 from processing.storage.formats.foreign_arrays import ImportFailed, open_array, states_first
 from processing.storage.integrity.h5_door import damage_as, read_npy
@@ -27,8 +29,6 @@ def read_frame(file: Path, page: int | None = None) -> NDArray[Any]:
 
 
 def _read_picture(file: Path, page: int | None) -> NDArray[Any]:
-    import cv2
-
     if file.suffix.lower() in LOSSY:
         raise ImportFailed(
             f"{file}: JPEG changes the grey values, and a gamma curve is usual in it: no polarization can be computed "
@@ -39,28 +39,35 @@ def _read_picture(file: Path, page: int | None) -> NDArray[Any]:
         raise ImportFailed(
             f"{file}: has {pages} pages, and one frame a state is needed. If each page is a state, add --stack '{file}'"
         )
-    # What is wrong is said in one line here, not in the library's own words.
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) if not page else _page(file, page)
-    except cv2.error as error:
+        image = _pixels(file, page or 0)
+    except ProcessError as error:
+        raise ImportFailed(f"{file}: is neither grey of 8 or 16 bits nor of 32-bit floats, and {error}") from error
+    except Exception as error:
+        # Readers of thirty formats raise whatever they like.
         raise ImportFailed(f"{file}: is damaged ({one_line(error)})") from error
-    if image is None:
-        raise ImportFailed(f"{file}: is not an image that can be read (PNG or TIFF)")
     if image.ndim == 3:
         grey = image[..., 0]
         colours = image[..., :3]
         if not np.array_equal(colours, np.broadcast_to(grey[..., None], colours.shape)):
             raise ImportFailed(f"{file}: is a colour image; frames are raw grey values of one channel")
         image = np.ascontiguousarray(grey)
-    return np.asarray(image)
+    return image
 
 
-def _page(file: Path, page: int) -> NDArray[Any] | None:
-    import cv2
+def _pixels(file: Path, page: int) -> NDArray[Any]:
+    """Values (rows, columns) or (rows, columns, colours) as they stand in the file."""
+    from PIL import Image
 
-    is_read, images = cv2.imreadmulti(str(file), page, 1, flags=cv2.IMREAD_UNCHANGED)
-    return np.asarray(images[0]) if is_read and images else None
+    with Image.open(file) as picture:
+        picture.seek(page)
+        if picture.mode in ("L", "F") or picture.mode.startswith("I;16"):
+            return np.asarray(picture)
+        if picture.mode != "I" and ";16" not in str(picture.tile) and picture.format in ("PNG", "TIFF", "BMP"):
+            return np.asarray(picture.convert("L" if picture.mode == "1" else "RGB"))
+    # Pillow makes 8 bits of 16 of a colour, and forgets whether an integer had a sign.
+    cv2 = needed("cv2", "fast")
+    return np.asarray(cv2.imreadmulti(str(file), page, 1, flags=cv2.IMREAD_UNCHANGED)[1][0])
 
 
 def open_stack(text: str, states: int | None, frame: tuple[int, int] | None = None) -> Any:

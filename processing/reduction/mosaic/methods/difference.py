@@ -4,12 +4,12 @@ The mean of all four channels around a pixel is known at full resolution; only e
 interpolated. Source: Mihoubi, Lapray, Bigué, Sensors 18, 3688 (2018).
 """
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Image
-from processing.reduction.mosaic.filling import BORDER, TENT, fill
+from processing.computing.filters import separable
+from processing.reduction.mosaic.filling import TENT, fill
 from processing.reduction.mosaic.layout import MosaicLayout
 
 REACH = 2
@@ -21,7 +21,7 @@ PANCHROMATIC = np.array([0.25, 0.5, 0.25], np.float32)
 
 def channels(frame: Image, layout: MosaicLayout) -> NDArray[np.float32]:
     """Images (channels, rows, columns)."""
-    mean = cv2.sepFilter2D(frame, -1, PANCHROMATIC, PANCHROMATIC, borderType=BORDER)
+    mean = separable(frame, PANCHROMATIC, PANCHROMATIC)
     out = fill(frame - mean, layout, TENT)
     out += mean
     return out

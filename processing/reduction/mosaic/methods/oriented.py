@@ -9,15 +9,14 @@ pass every kernel unchanged. The priors below were set on scenes that docs/studi
 
 from functools import lru_cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from processing.arrays import Image
 from processing.computing.compiling import njit
+from processing.computing.filters import gaussian, separable
 from processing.computing.threads import for_ranges
-from processing.reduction.mosaic.filling import BORDER
 from processing.reduction.mosaic.layout import PAIRS, MosaicLayout
 
 #: Kernels reach this many pixels to each side.
@@ -37,7 +36,7 @@ _CONSTANT = 1e3
 
 # An edge: gradients over about 3 pixels agree in direction by this much, and are this part of the signal a pixel.
 _AGREEMENT, _CONTRAST, _SMOOTHING_PX = 0.6, 0.02, 1.5
-_SCHARR = 32.0
+_SCHARR, _SCHARR_SUM = (np.array([-1.0, 0.0, 1.0]), np.array([3.0, 10.0, 3.0])), 32.0
 
 
 def channels(frame: Image, layout: MosaicLayout) -> NDArray[np.float32]:
@@ -94,7 +93,7 @@ def _first_pass(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]:
     """Channels without direction, the directions of edges, and the padded frame."""
     kernels = _kernels(layout)
-    padded = np.asarray(cv2.copyMakeBorder(frame, REACH, REACH, REACH, REACH, BORDER))
+    padded = np.pad(frame, REACH, mode="reflect")
     columns = np.ascontiguousarray(np.stack([padded[:, 0::2], padded[:, 1::2]]))
     out = np.empty((len(layout.channels), *frame.shape), np.float32)
     for_ranges(frame.shape[0], lambda a, b: _everywhere(columns, kernels[0], out, a, b), 2, 64)
@@ -103,12 +102,12 @@ def _first_pass(
 
 def _edges(mean: Image) -> NDArray[np.uint8]:
     """For each pixel 0, or 1 + the direction of its edge in steps of 180 / DIRECTIONS degrees."""
-    gx, gy = cv2.Scharr(mean, cv2.CV_32F, 1, 0), cv2.Scharr(mean, cv2.CV_32F, 0, 1)
-    xx, xy, yy = (cv2.GaussianBlur(p, (0, 0), _SMOOTHING_PX) for p in (gx * gx, gx * gy, gy * gy))
+    gx, gy = separable(mean, *_SCHARR), separable(mean, *_SCHARR[::-1])
+    xx, xy, yy = (gaussian(p, _SMOOTHING_PX) for p in (gx * gx, gx * gy, gy * gy))
     along = 0.5 * np.arctan2(2 * xy, xx - yy) + np.pi / 2
     agreement = np.hypot(xx - yy, 2 * xy) / (xx + yy + 1e-20)
-    level = cv2.GaussianBlur(np.abs(mean), (0, 0), _SMOOTHING_PX)
-    edge = (agreement > _AGREEMENT) & (np.sqrt(xx + yy) / _SCHARR > _CONTRAST * level)
+    level = gaussian(np.abs(mean), _SMOOTHING_PX)
+    edge = (agreement > _AGREEMENT) & (np.sqrt(xx + yy) / _SCHARR_SUM > _CONTRAST * level)
     step = np.rint(along / np.pi * DIRECTIONS).astype(np.int64) % DIRECTIONS
     return np.where(edge, step + 1, 0).astype(np.uint8)
 
