@@ -1,7 +1,6 @@
 """Feed planar images of any real type to compiled loops that know float64 chunks only.
 
-Each further type or layout of a big loop costs seconds of compilation, so only the two copies are compiled for each.
-They are compiled at all because numpy's converting copies cost as much as the arithmetic in between.
+Each further type or layout of a big loop would cost seconds of compilation.
 """
 
 from collections.abc import Callable
@@ -10,13 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.computing.compiling import njit
 from processing.computing.threads import for_ranges
 
 #: Pixels that a compiled loop gets at a time: small enough for the second-level cache.
 CHUNK = 2048
-
-_jit = njit(cache=True, nogil=True)
 
 
 def for_chunks(kernel: Callable[..., object], source: NDArray[Any], *outputs: NDArray[Any]) -> None:
@@ -39,25 +35,9 @@ def for_chunks(kernel: Callable[..., object], source: NDArray[Any], *outputs: ND
         rows = [result.reshape(-1, CHUNK) for result in results]
         for first in range(start, stop, CHUNK):
             count = min(CHUNK, stop - first)
-            _fetch(source, first, count, chunk)
+            chunk[:, :count] = source[:, first : first + count]
             kernel(chunk, count, *results)
             for out, result in zip(flat, rows, strict=True):
-                _store(result, count, out, first)
+                out[:, first : first + count] = result[:, :count]
 
     for_ranges(source.shape[1], loop)
-
-
-@_jit
-def _fetch(source, first, count, chunk):  # type: ignore[no-untyped-def]
-    for k in range(source.shape[0]):
-        row = source[k, first : first + count]
-        for j in range(count):
-            chunk[k, j] = row[j]
-
-
-@_jit
-def _store(chunk, count, out, first):  # type: ignore[no-untyped-def]
-    for k in range(out.shape[0]):
-        row = out[k, first : first + count]
-        for j in range(count):
-            row[j] = chunk[k, j]

@@ -1,11 +1,38 @@
-"""The compiled loop of meshes: where a ray meets its triangle, and the normal there."""
+"""The loop of meshes: where a ray meets its triangle, and the normal there."""
 
 import numpy as np
+from numpy.typing import NDArray
 
-from processing.computing.compiling import njit
+from processing.arrays import Array
+from processing.computing.compiling import compiled, in_parts
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@in_parts
+def _meet_at_once(
+    index: NDArray[np.intp],
+    face: NDArray[np.intp],
+    rays: Array,
+    origin: Array,
+    triangles: Array,
+    face_normals: Array,
+    corner_normals: Array,
+    points: Array,
+    normals: Array,
+    part: slice,
+) -> None:
+    ray = rays[index[part]]
+    f = face[index[part]]
+    normal, corners = face_normals[f], triangles[f]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.einsum("ni,ni->n", corners[:, 0] - origin, normal) / np.einsum("ni,ni->n", ray, normal)
+        points[part] = origin + t[:, None] * ray
+        away = corners - points[part, None]
+        area = np.cross(np.roll(away, -1, axis=1), np.roll(away, -2, axis=1))
+        found = np.einsum("nki,ni,nkj->nj", area, normal, corner_normals[f])
+        normals[part] = found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+@compiled(_meet_at_once, error_model="numpy")
 def meet(index, face, rays, origin, triangles, face_normals, corner_normals, points, normals, start, stop):  # type: ignore[no-untyped-def]
     """Points and unit normals where rays[index[start:stop]] meet their triangles; writes `points` and `normals`.
 
@@ -35,6 +62,6 @@ def meet(index, face, rays, origin, triangles, face_normals, corner_normals, poi
             normals[k, i] /= length
 
 
-@njit(inline="always")
+@compiled(inline="always")
 def _area(px, py, pz, qx, qy, qz, n0, n1, n2):  # type: ignore[no-untyped-def]
     return (py * qz - pz * qy) * n0 + (pz * qx - px * qz) * n1 + (px * qy - py * qx) * n2

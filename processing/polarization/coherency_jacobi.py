@@ -5,16 +5,19 @@ and vectorizes along pixels.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 
-from processing.computing.compiling import njit
+from processing.computing.compiling import compiled
 
 T = 256  # pixels in a tile
 SWEEPS = 8
 OFF_DIAGONAL = 1e-31  # sum of squares left, in units where tr A^2 = 1
 
-jit = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+#: Options of `compiled`.
+EXACT: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "nsz"}}
+jit = compiled(**EXACT)
 
 
 @jit

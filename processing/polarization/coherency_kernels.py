@@ -1,4 +1,4 @@
-"""Compiled loops over many small coherency matrices, behind `processing.polarization.cloude`.
+"""Loops over many small coherency matrices, behind `processing.polarization.cloude`.
 
 Pixels are handled in tiles of T, stored element by element (element, pixel), so that every inner loop
 runs along pixels and the compiler turns it into vector instructions. All arithmetic is in float64 whatever the
@@ -12,8 +12,12 @@ precision for strong depolarizers, where H is close to 1/4.
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from processing.polarization.coherency_jacobi import T, jacobi_tile, jit, project
+from processing.arrays import Array
+from processing.computing.compiling import compiled
+from processing.polarization.coherency_jacobi import EXACT, T, jacobi_tile, jit, project
+from processing.polarization.mueller import coherency, from_jones
 
 NEWTON_STEPS = 12
 # The error after a step is step^2 p''/(2 p'), at most 4e3 step^2 where the slope is not too small: no digit is left.
@@ -219,7 +223,44 @@ def dominant_tile(a, b, x, count, c, out, start):  # type: ignore[no-untyped-def
             row[j] = c[k * T + j]
 
 
-@jit
+def _scaled(m: Array, pixels: int) -> tuple[NDArray[np.complex128], Array]:
+    """A (pixels, 4, 4) of planar m, and its scale, as `load_tile` has them; zero where the scale is NaN."""
+    matrices = m[:, :pixels].T.reshape(-1, 4, 4)
+    sound = (matrices[:, 0, 0] > 0) & np.isfinite(matrices).all(axis=(1, 2))
+    matrices = np.where(sound[:, None, None], matrices, np.diag([1.0, 0, 0, 0]))
+    a = coherency(matrices) / (2 * matrices[:, :1, :1]) - np.eye(4) / 4
+    square = np.square(np.abs(a)).sum(axis=(1, 2))
+    scale = np.sqrt(np.where(square > SMALLEST_NORM, square, 0.0))
+    a /= np.where(scale > 0, scale, np.inf)[:, None, None]
+    return a, np.where(sound, scale, np.nan)
+
+
+def _processes(vectors: NDArray[np.complex128], scale: Array) -> Array:
+    """Mueller-Jones matrices (16, pixels) of eigenvectors (pixels, 4)."""
+    found = from_jones(vectors.reshape(-1, 2, 2)).reshape(-1, 16).T
+    return np.where(scale > 0, found / found[0], np.nan)
+
+
+def _dominant_at_once(m: Array, pixels: int, xi0: Array, out: Array) -> None:
+    a, scale = _scaled(m, pixels)
+    values, vectors = np.linalg.eigh(a)
+    xi0[:pixels] = 0.25 + scale * values[:, 3]
+    out[:, :pixels] = _processes(vectors[..., 3], scale)
+
+
+def _eigenvalues_at_once(m: Array, pixels: int, xi: Array) -> None:
+    a, scale = _scaled(m, pixels)
+    xi[:, :pixels] = 0.25 + scale * np.linalg.eigvalsh(a)[:, ::-1].T
+
+
+def _eigensystem_at_once(m: Array, pixels: int, xi: Array, out: Array) -> None:
+    a, scale = _scaled(m, pixels)
+    values, vectors = np.linalg.eigh(a)
+    xi[:, :pixels] = 0.25 + scale * values[:, ::-1].T
+    out[..., :pixels] = [_processes(vectors[..., k], scale) for k in (3, 2, 1, 0)]
+
+
+@compiled(_dominant_at_once, **EXACT)
 def dominant(m, pixels, xi0, out):  # type: ignore[no-untyped-def]
     """Largest eigenvalue (pixels,) and dominant Mueller-Jones matrix (16, pixels) of planar m (16, at least pixels)."""
     a, b, c, v = np.empty(16 * T), np.empty(16 * T), np.empty(16 * T), np.empty(32 * T)
@@ -246,7 +287,7 @@ def dominant(m, pixels, xi0, out):  # type: ignore[no-untyped-def]
                     project(v, best, j, norm[j], out, first + j)
 
 
-@jit
+@compiled(_eigenvalues_at_once, **EXACT)
 def eigenvalues(m, pixels, xi):  # type: ignore[no-untyped-def]
     """All eigenvalues, descending, into xi (4, pixels)."""
     a, b, norm = np.empty(16 * T), np.empty(16 * T), np.empty(T)
@@ -264,7 +305,7 @@ def eigenvalues(m, pixels, xi):  # type: ignore[no-untyped-def]
                 xi[at, first + j] = value
 
 
-@jit
+@compiled(_eigensystem_at_once, **EXACT)
 def eigensystem(m, pixels, xi, out):  # type: ignore[no-untyped-def]
     """All eigenvalues, descending, into xi (4, pixels), and their Mueller-Jones matrices into out (4, 16, pixels)."""
     a, b, v = np.empty(16 * T), np.empty(16 * T), np.empty(32 * T)

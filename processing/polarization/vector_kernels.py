@@ -1,8 +1,12 @@
-"""Compiled loops over pixels behind `vector_noise`, `magnitude` and `sorted_eigenvalues`."""
+"""Loops over pixels behind `vector_noise`, `magnitude` and `sorted_eigenvalues`."""
+
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from processing.computing.compiling import njit
+from processing.arrays import Array
+from processing.computing.compiling import compiled, in_parts
 
 #: Of the 68 and 95 % interval.
 DEVIATES = (1.0, 1.959964)
@@ -14,10 +18,74 @@ _STEPS, _CLOSE = 6, 3e-3
 #: A variance that changes by less than this part is taken as it is.
 _ALIKE = 0.08
 
-_jit = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"})
+_FAST: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
 
 
-@_jit
+@in_parts
+def _elements_at_once(m: Array, numbers: NDArray[np.int64], covariance: Array, out: Array, part: slice) -> None:
+    m, covariance = m[part].astype(float), covariance[part].astype(float)
+    v = m[:, numbers] / m[:, :1]
+    by = covariance[:, 0, numbers] - v * covariance[:, 0, :1] / 2
+    c = covariance[:, numbers[:, None], numbers] - v[:, None] * by[..., None] - v[..., None] * by[:, None]
+    _moments_at_once(c / m[:, :1, None] ** 2, v, out[:, part])
+
+
+@in_parts
+def _slopes_at_once(vector: Array, by_element: Array, covariance: Array, out: Array, part: slice) -> None:
+    by = np.moveaxis(by_element[:, part].astype(float), 0, 1)
+    _moments_at_once(by @ covariance[part] @ np.swapaxes(by, 1, 2), vector[:, part].T.astype(float), out[:, part])
+
+
+def _moments_at_once(c: Array, v: Array, out: Array) -> None:
+    n = len(v.T)
+    with np.errstate(all="ignore"):
+        total, square, size = np.trace(c, axis1=1, axis2=2), np.einsum("pij,pij->p", c, c), np.einsum("pi,pi->p", v, v)
+        by = np.einsum("pij,pj->pi", c, v)
+        along = np.einsum("pi,pi->p", by, v) / size
+        by -= along[:, None] * v
+        turned = np.einsum("pi,pi->p", by, by)
+        mixed = np.sqrt(turned / size)
+        turn = DEVIATES[1] * mixed / np.sqrt(along * size)
+        counts = turn * (2 * mixed + turn * total) >= _ALIKE * along
+        across = np.where(counts, np.einsum("pi,pij,pj->p", by, c, by, optimize=True) / turned, 0.0)
+        out[:3] = along, total, square
+        out[3:5] = _reach_at_once(np.sqrt(size), along, mixed, across)
+    packed = [(i + apart, i) for apart in range(3) for i in range(3 - apart)]
+    out[5:] = [c[:, i, j] if i < n else np.full(len(c), np.nan) for i, j in packed]
+
+
+def _reach_at_once(length: Array, along: Array, mixed: Array, across: Array) -> tuple[Array, Array]:
+    half, centre, z = (along - across) / 2, (along + across) / 2, DEVIATES[1]
+    turn = z * mixed / (np.sqrt(along) * length)
+    alike = turn * (2 * mixed + turn * across) < _ALIKE * along
+    radius = np.hypot(half, mixed)
+    first, second = centre + radius, np.maximum(centre - radius, 1e-6 * centre)
+    one = length * length * (1 + half / radius) / 2
+    ends = [_farthest_at_once(length, first, second, one, length * length - one, side) for side in (1.0, -1.0)]
+    short = np.where(length * length > z * z * along, along, np.inf)
+    return np.where(alike, short, ends[0]), np.where(alike, along, ends[1])
+
+
+def _farthest_at_once(length: Array, first: Array, second: Array, one: Array, other: Array, side: float) -> Array:
+    z, low, high, t = DEVIATES[1], np.zeros_like(first), 1 / first, np.zeros_like(first)
+    white = np.sqrt(one / first + other / second)
+    if side > 0:
+        high = t = (one / first**2 + other / second**2) / white**3 / (1 / z - 1 / white)
+    for _ in range(_STEPS):
+        a, b = 1 / (1 + side * t * first), 1 / (1 + side * t * second)
+        inverse = 1 / np.sqrt(first * one * a * a + second * other * b * b)
+        off = inverse - t / z
+        slope = side * (first * first * one * a**3 + second * second * other * b**3) * inverse**3 - 1 / z
+        moves = ~(np.abs(off) < _CLOSE * inverse)
+        low, high = np.where(moves & (off > 0), t, low), np.where(moves & ~(off > 0), t, high)
+        step = t - off / slope
+        t = np.where(moves, np.where((low <= step) & (step <= high), step, (low + high) / 2), t)
+    a, b = 1 / (1 + side * t * first), 1 / (1 + side * t * second)
+    off = (np.sqrt(one * a * a + other * b * b) - length) / z
+    return np.where((side > 0) & (white <= z), np.inf, off * off)
+
+
+@compiled(_elements_at_once, **_FAST)
 def elements(m, numbers, covariance, out, start, stop):  # type: ignore[no-untyped-def]
     n = len(numbers)
     c, v, by = np.empty((n, n), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
@@ -34,7 +102,7 @@ def elements(m, numbers, covariance, out, start, stop):  # type: ignore[no-untyp
         _moments(c, v, out, p)
 
 
-@_jit
+@compiled(_slopes_at_once, **_FAST)
 def slopes(vector, by_element, covariance, out, start, stop):  # type: ignore[no-untyped-def]
     n = len(by_element)
     c, by = np.empty((n, n), np.float32), np.empty(16, np.float32)
@@ -51,7 +119,7 @@ def slopes(vector, by_element, covariance, out, start, stop):  # type: ignore[no
         _moments(c, vector[:, p], out, p)
 
 
-@_jit
+@compiled(**_FAST)
 def _moments(c, v, out, p):  # type: ignore[no-untyped-def]
     """`vector_noise.VectorNoise` of a vector v and its covariance, the lower half of which is filled."""
     n = len(c)
@@ -92,7 +160,7 @@ def _moments(c, v, out, p):  # type: ignore[no-untyped-def]
             place += 1
 
 
-@_jit
+@compiled(**_FAST)
 def _reach(length, along, mixed, across, out):  # type: ignore[no-untyped-def]
     """`below` and `above` of a vector (length, 0) of covariance ((along, mixed), (mixed, across))."""
     half, centre = (along - across) / 2, (along + across) / 2
@@ -112,7 +180,7 @@ def _reach(length, along, mixed, across, out):  # type: ignore[no-untyped-def]
     out[1] = _farthest(length, first, second, one, other, z, -1.0)
 
 
-@_jit
+@compiled(**_FAST)
 def _farthest(length, first, second, one, other, z, side):  # type: ignore[no-untyped-def]
     """By Newton's method on the multiplier t of mu = (1 + side t C)^-1 v, which is that far from v."""
     low, high, t = 0.0, 1 / first, 0.0
@@ -142,7 +210,48 @@ def _farthest(length, first, second, one, other, z, side):  # type: ignore[no-un
     return off * off
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+def _mixed(table: Array, i: Any, x: Any, j: Any, y: Any, k: Any, z: Any) -> Any:
+    a = (1 - z) * table[i, j, k] + z * table[i, j, k + 1]
+    b = (1 - z) * table[i, j + 1, k] + z * table[i, j + 1, k + 1]
+    c = (1 - z) * table[i + 1, j, k] + z * table[i + 1, j, k + 1]
+    d = (1 - z) * table[i + 1, j + 1, k] + z * table[i + 1, j + 1, k + 1]
+    return (1 - x) * ((1 - y) * a + y * b) + x * ((1 - y) * c + y * d)
+
+
+_at = compiled()(_mixed)
+
+
+def _places(values: Array, nodes: Array) -> tuple[NDArray[np.intp], Array]:
+    i = np.clip(np.searchsorted(nodes, values, side="right") - 1, 0, len(nodes) - 2)
+    return i, np.clip((values - nodes[i]) / (nodes[i + 1] - nodes[i]), 0.0, 1.0)
+
+
+@in_parts
+def _lengths_at_once(table: Array, nodes: tuple[Array, ...], given: Array, out: Array, part: slice) -> None:
+    with np.errstate(all="ignore"):
+        length, along, total, square, below, above = given[:, part]
+        unit, components, farthest = np.sqrt(square / total), total * total / square, nodes[2][-1]
+        seen = length / unit
+        known = np.isfinite(seen) & (seen >= 0) & np.isfinite(components) & np.isfinite(along)
+        seen, near = np.where(known, seen, 0.0), seen < farthest
+        (i, x), (k, z) = _places(components, nodes[0]), _places(seen, nodes[2])
+        far, ends = np.sqrt(np.maximum(seen * seen - components + along / unit**2, 1.0)), []
+        for n, variance in enumerate((along, along, below, above)):
+            share = variance / unit**2
+            j, y = _places(share / np.sqrt(components), nodes[1])
+            spread = np.sqrt(share + np.maximum(components - share * share, 0.0) / (2 * far * far))
+            beyond = far + (2 * (n % 2) - 1) * DEVIATES[n // 2] * spread
+            end = np.where(near, _mixed(table[n], i, x, j, y, k, z), beyond)
+            ends.append(np.where(np.isinf(share), 0.0, end))
+        low, high, low_95, high_95 = ends
+        limit = np.minimum(high * high / _mixed(table[4], i, x, j, y, k, z), high)
+        value = np.where(low > 0, low + high, limit) / 2
+        error = np.where(near, np.maximum(high - value, LEAST), high - value)
+        found = np.stack([value, error, np.maximum(low_95, 0.0), high_95]) * unit
+        out[:, part] = np.where(known, found, np.nan)
+
+
+@compiled(_lengths_at_once, error_model="numpy")
 def lengths(table, nodes, given, out, start, stop):  # type: ignore[no-untyped-def]
     """`magnitude.Interval` (4, pixels) of length, along, total, square, below and above (6, pixels)."""
     ends = np.empty(4)
@@ -183,7 +292,7 @@ def lengths(table, nodes, given, out, start, stop):  # type: ignore[no-untyped-d
         out[2, p], out[3, p] = max(ends[2], 0.0) * unit, ends[3] * unit
 
 
-@njit(cache=True, nogil=True)
+@compiled()
 def _place(value, nodes):  # type: ignore[no-untyped-def]
     """Node below a value, and how far it is to the next: 0 to 1."""
     i = 0
@@ -192,16 +301,19 @@ def _place(value, nodes):  # type: ignore[no-untyped-def]
     return i, min(max((value - nodes[i]) / (nodes[i + 1] - nodes[i]), 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True)
-def _at(table, i, x, j, y, k, z):  # type: ignore[no-untyped-def]
-    a = (1 - z) * table[i, j, k] + z * table[i, j, k + 1]
-    b = (1 - z) * table[i, j + 1, k] + z * table[i, j + 1, k + 1]
-    c = (1 - z) * table[i + 1, j, k] + z * table[i + 1, j, k + 1]
-    d = (1 - z) * table[i + 1, j + 1, k] + z * table[i + 1, j + 1, k + 1]
-    return (1 - x) * ((1 - y) * a + y * b) + x * ((1 - y) * c + y * d)
+def _interpolate_at_once(table: Array, places: Array, out: Array) -> None:
+    @in_parts
+    def each(part: slice) -> None:
+        last = np.array(table.shape[:3])[:, None] - 1
+        inside = np.minimum(places[:, part], last)
+        node = np.minimum(inside.astype(int), last - 1)
+        words = [w for i, x in zip(node, (inside - node)[..., None], strict=True) for w in (i, x)]
+        out[:, part] = _mixed(table, *words).T
+
+    each(0, places.shape[1])
 
 
-@njit(cache=True, nogil=True)
+@compiled(_interpolate_at_once)
 def interpolate(table, places, out):  # type: ignore[no-untyped-def]
     """Linear interpolation of all planes of a table (n, m, k, planes) at `places` (3, pixels); beyond it the last."""
     last = (table.shape[0] - 1, table.shape[1] - 1, table.shape[2] - 1)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from processing.arrays import Array, BoolArray
-from processing.computing.compiling import njit
+from processing.computing.compiling import compiled, in_parts
 from processing.computing.threads import for_ranges
 from processing.errors import ProcessError
 from processing.polarization.mueller import coherency
@@ -230,7 +230,20 @@ def xi0_and_m00(
     return xi0, m00
 
 
-@njit(nogil=True, fastmath={"contract", "reassoc", "arcp", "nsz"}, error_model="numpy", cache=True)
+@in_parts
+def _four_at_once(i4: Array, q4: Array, pid: Array, xi0: Array, m00: Array, part: slice) -> None:
+    unit = pid / np.sqrt(pid @ pid)
+    p, q, length = i4[:, part].astype(np.float32), q4[:, part], np.sqrt(pid @ pid)
+    share, level = unit @ q, unit @ p
+    across = q - share * unit[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        alpha_0 = (across * (p - level * unit[:, None])).sum(axis=0) / np.square(across).sum(axis=0)
+        alpha_id = (level - alpha_0 * share) / length
+        m00[part] = alpha_0 + alpha_id
+        xi0[part] = (alpha_0 + alpha_id / 4) / m00[part]
+
+
+@compiled(_four_at_once, fastmath={"contract", "reassoc", "arcp", "nsz"}, error_model="numpy")
 def _four(i4, q4, pid, xi0, m00, start, stop):  # type: ignore[no-untyped-def]
     # Slices, a loop from 0 and division without exceptions: only then are eight pixels taken at a time.
     one = np.float32(1.0)

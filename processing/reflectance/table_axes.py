@@ -6,7 +6,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.computing.compiling import njit
+from processing.arrays import Array
+from processing.computing.compiling import compiled
 from processing.computing.threads import for_ranges
 from processing.geometry.rusinkiewicz import Angles
 
@@ -59,7 +60,17 @@ class TableAxes:
         return Angles(*(np.deg2rad(v) for v in (self.theta_h_deg[i], self.theta_d_deg[j], self.phi_d_deg[k])))
 
 
-@njit(nogil=True, cache=True)
+def _bins_at_once(
+    th: Array, td: Array, pd: Array, renderer: bool, out: NDArray[np.int32], start: int, stop: int
+) -> None:
+    th, td, pd = (np.rad2deg(v[start:stop]) for v in (th, td, pd))
+    with np.errstate(invalid="ignore"):
+        axes = [np.minimum(np.rint(v), 90) for v in (90 * np.sqrt(th / 90) if renderer else th, td)]
+        bins = (axes[0] * 91 + axes[1]) * 361 + (np.rint(pd) + 180) % 360
+        out[start:stop] = np.where(np.isfinite(th + td + pd), bins, -1)
+
+
+@compiled(_bins_at_once)
 def _bins(th, td, pd, renderer, out, start, stop):  # type: ignore[no-untyped-def]
     degree = 180.0 / np.pi
     for n in range(start, stop):

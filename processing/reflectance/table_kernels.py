@@ -1,34 +1,26 @@
-"""Loops over the samples of a table: which are known, in which row each is, and the sums of each row."""
+"""Loops over the samples of a table: in which row each is, and the sums of each row."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.computing.compiling import njit
+from processing.computing.compiling import compiled
 from processing.computing.threads import for_ranges
 
 
-@njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
-def plane_sums(values, out, start, stop):  # type: ignore[no-untyped-def]
-    # Finite when every value is: far quicker than to look at each pixel.
-    for c in range(start, stop):
-        total = values.dtype.type(0)
-        for n in range(values.shape[1]):
-            total += values[c, n]
-        out[c] = total
+def _claim_rows_at_once(
+    bins: NDArray[np.int32], row_of_bin: NDArray[np.int32], used: int, found: NDArray[np.int32]
+) -> int:
+    known = bins >= 0
+    new, first = np.unique(bins[known & (row_of_bin[bins] < 0)], return_index=True)
+    new = new[np.argsort(first)]
+    row_of_bin[new] = used + np.arange(new.size)
+    found[: new.size] = new
+    bins[known] = row_of_bin[bins[known]]
+    return new.size
 
 
-@njit(nogil=True, cache=True)
-def drop_unknown(rows, values):  # type: ignore[no-untyped-def]
-    for n in range(rows.size):
-        total = 0.0
-        for c in range(values.shape[0]):
-            total += values[c, n]
-        if not np.isfinite(total):
-            rows[n] = -1
-
-
-@njit(cache=True)
+@compiled(_claim_rows_at_once)
 def claim_rows(bins, row_of_bin, used, found):  # type: ignore[no-untyped-def]
     # Replaces each bin by its row in the sparse arrays; new bins get the next rows.
     new = 0
@@ -58,7 +50,26 @@ def add_sums(
     )
 
 
-@njit(nogil=True, cache=True, fastmath={"contract"})
+def _accumulate_at_once(
+    rows: NDArray[np.int32],
+    values: Array,
+    total: Array,
+    square: Array,
+    count: NDArray[np.int64],
+    start: int,
+    stop: int,
+) -> None:
+    known = np.flatnonzero(rows >= 0)
+    row = rows[known]
+    for n in range(4 * start, min(4 * stop, len(values))):
+        one = values[n, known].astype(float)
+        total[n] += np.bincount(row, one, count.size)
+        square[n] += np.bincount(row, one * one, count.size)
+    if start == 0:
+        count += np.bincount(row, minlength=count.size)
+
+
+@compiled(_accumulate_at_once, fastmath={"contract"})
 def _accumulate(rows, values, total, square, count, start, stop):  # type: ignore[no-untyped-def]
     # Four quantities a thread: no two threads write to one place, and the eight sums do not wait for each
     # other. A run of pixels in one bin, the rule in an image, stays in registers.

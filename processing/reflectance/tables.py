@@ -17,7 +17,7 @@ from processing.errors import ProcessError
 from processing.geometry.rusinkiewicz import Angles
 from processing.instrument.uncertainty import of_all_inputs
 from processing.reflectance.table_axes import SHAPE, Layout, TableAxes
-from processing.reflectance.table_kernels import add_sums, claim_rows, drop_unknown, plane_sums
+from processing.reflectance.table_kernels import add_sums, claim_rows
 from processing.storage.captures.nexus import add_group, add_scales, attach, declare, default_plot, describe_light
 from processing.storage.integrity.h5_door import damage_as, mark_of, open_h5, require_dataset, require_group
 from processing.storage.integrity.packed import LEVEL, Packing
@@ -138,9 +138,10 @@ class ScatteringTable:
             v = v.astype(np.float64)
         rows = self._scratch = self.axes.bins(angles, self._scratch).reshape(-1)
         sums = np.empty(len(v))
-        for_ranges(len(v), lambda start, stop: plane_sums(v, sums, start, stop), align=1, smallest=1)
+        for_ranges(len(v), lambda a, b: v[a:b].sum(axis=1, out=sums[a:b]), align=1, smallest=1)
+        # Far quicker than to look at each pixel.
         if not np.all(np.isfinite(sums)):
-            drop_unknown(rows, v)
+            rows[~np.isfinite(v).all(axis=0)] = -1
         self._claim(rows)
         add_sums(rows, v[:quantities], self._sum, self._square, self.count)
         samples, further = np.flatnonzero(rows >= 0), self._sum[quantities:]

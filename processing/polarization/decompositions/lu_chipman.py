@@ -56,7 +56,7 @@ def lu_chipman(m: RealArray) -> LuChipman:
     planar = np.ascontiguousarray(planar)
     md, mr, mdelta = (np.empty((16, planar.shape[1]), planar.dtype) for _ in range(3))
     sign = np.empty(planar.shape[1])
-    for_ranges(planar.shape[1], lambda start, stop: lu_chipman_range(planar, start, stop, mdelta, mr, md, sign))
+    for_ranges(planar.shape[1], lambda start, stop: lu_chipman_range(planar, mdelta, mr, md, sign, start, stop))
     depolarizer, retarder, diattenuator = (
         np.moveaxis(f.reshape(4, 4, *shape), (0, 1), (-2, -1)) for f in (mdelta, mr, md)
     )

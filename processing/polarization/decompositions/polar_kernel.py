@@ -1,4 +1,4 @@
-"""Compiled loop of the Lu-Chipman decomposition, behind `processing.polarization.decompositions.lu_chipman`.
+"""Loop of the Lu-Chipman decomposition, behind `processing.polarization.decompositions.lu_chipman`.
 
 Tiles as in `polarization.coherency_kernels`: rows of T pixels, so that every inner loop becomes vector instructions.
 The rotation is the orthogonal polar factor of the 3 x 3 remainder, by Newton's iteration X <- (X + X^-T) / 2 with
@@ -9,15 +9,49 @@ import math
 
 import numpy as np
 
-from processing.polarization.coherency_jacobi import T, jit
+from processing.arrays import Array, RealArray
+from processing.computing.compiling import compiled, in_parts
+from processing.polarization.coherency_jacobi import EXACT, T, jit
 
 STEPS = 14
 #: det m' relative to |m'|^3 below this is rounding: the rotation is then not determined.
 SMALLEST_DETERMINANT = 1e-12
 
 
-@jit
-def lu_chipman_range(m, start, stop, depolarizer, retarder, diattenuator, sign):  # type: ignore[no-untyped-def]
+@in_parts
+def _at_once(
+    planar: RealArray, depolarizer: RealArray, retarder: RealArray, diattenuator: RealArray, sign: Array, part: slice
+) -> None:
+    m = planar[:, part].T.reshape(-1, 4, 4).astype(float)
+    one, three = np.eye(4), np.eye(3)
+    with np.errstate(all="ignore"):
+        m00 = np.where(m[:, 0, 0] > 0, m[:, 0, 0], np.nan)[:, None, None]
+        m /= m00
+        d, p = m[:, :1, 1:], m[:, 1:, :1]
+        outer, square = np.swapaxes(d, 1, 2) @ d, (d @ np.swapaxes(d, 1, 2))
+        q = np.sqrt(np.where(square < 1, 1 - square, np.nan))
+        x = (m[:, 1:, 1:] - p @ d) @ (three + outer / (q + q * q)) / q
+        relative = np.linalg.det(x) / np.square(x).sum(axis=(1, 2)) ** 1.5
+        turn = np.where(np.abs(relative) > SMALLEST_DETERMINANT, np.sign(relative), np.nan)[:, None, None]
+        u, _, vt = np.linalg.svd(np.where(np.isnan(turn), three, x))
+        r = turn * (u @ vt)
+        block = x @ np.swapaxes(r, 1, 2)
+        parts = np.empty((3, len(m), 4, 4))
+        parts[:] = one + 0 * turn
+        parts[0, :, 1:, :1] = (p - m[:, 1:, 1:] @ np.swapaxes(d, 1, 2)) / (q * q) + 0 * turn
+        parts[0, :, 1:, 1:] = (block + np.swapaxes(block, 1, 2)) / 2
+        parts[1, :, 1:, 1:] = r
+        parts[2] = m00 * (1 + 0 * q)
+        parts[2, :, :1, 1:] *= d
+        parts[2, :, 1:, :1] *= np.swapaxes(d, 1, 2)
+        parts[2, :, 1:, 1:] *= q * three + outer / (1 + q)
+    for out, factor in zip((depolarizer, retarder, diattenuator), parts, strict=True):
+        out[:, part] = factor.reshape(-1, 16).T
+    sign[part] = turn[:, 0, 0]
+
+
+@compiled(_at_once, **EXACT)
+def lu_chipman_range(m, depolarizer, retarder, diattenuator, sign, start, stop):  # type: ignore[no-untyped-def]
     """Planar factors (16, pixels) of planar m (16, pixels); sign (pixels,) is that of det m', NaN where undefined."""
     one, x, r, state = np.empty(16 * T), np.empty(9 * T), np.empty(9 * T), np.empty(T)
     for first in range(start, stop, T):

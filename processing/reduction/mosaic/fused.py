@@ -3,13 +3,13 @@
 The same numbers as `methods/bilinear.py` followed by the solution for S, DoLP and AoLP, without the images between.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Image
-from processing.computing.compiling import njit
+from processing.computing.compiling import compiled
 from processing.computing.threads import for_ranges
 from processing.reduction.mosaic.layout import MosaicLayout
 
@@ -51,7 +51,34 @@ def bilinear_stokes(
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp", "nnan", "ninf"})
+def _rows_at_once(
+    frame: NDArray[Any],
+    m: Image,
+    s0: Image,
+    s1: Image,
+    s2: Image,
+    dolp: Image,
+    aolp: Image,
+    first: int,
+    last: int,
+) -> None:
+    wide = np.pad(frame.astype(np.float32), 1, mode="reflect")[first : last + 2]
+    planes = []
+    for image in (wide[1:-1], (wide[:-2] + wide[2:]) / 2):
+        pair = [image[:, 1:-1], (image[:, :-2] + image[:, 2:]) / 2]
+        for plane in pair:
+            planes.append(plane.copy())
+        planes[-2][:, 1::2], planes[-1][:, 1::2] = pair[1][:, 1::2], pair[0][:, 1::2]
+    channels = np.asarray(planes, dtype=np.float32)
+    channels[:, 1::2] = np.roll(channels[:, 1::2], 2, axis=0)
+    a, b, c = np.tensordot(m, channels, 1)
+    s0[first:last], s1[first:last], s2[first:last] = a, b, c
+    with np.errstate(divide="ignore", invalid="ignore"):
+        dolp[first:last] = np.hypot(b, c) / a
+    aolp[first:last] = np.arctan2(c, b) / 2 % np.pi
+
+
+@compiled(_rows_at_once, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp", "nnan", "ninf"})
 def _rows(frame, m, s0, s1, s2, dolp, aolp, first, last):  # type: ignore[no-untyped-def]
     height, width = frame.shape
     own, other = np.empty(width + 2, np.float32), np.empty(width + 2, np.float32)

@@ -1,14 +1,17 @@
-"""Compiled loops over many small symmetric systems, one for each pixel, behind `processing.reduction.solvers.weighted`.
+"""Loops over many small symmetric systems, one for each pixel, behind `processing.reduction.solvers.weighted`.
 
 Packed symmetric 16 x 16 matrices are rows (136, pixels), lower triangle row by row. Pixels are handled in tiles
 so that every inner loop runs along pixels and becomes vector instructions; arithmetic is in float64.
 """
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from processing.computing.compiling import njit
+from processing.arrays import Array
+from processing.computing.compiling import compiled, in_parts
 
 ELEMENTS = 16
 PACKED = ELEMENTS * (ELEMENTS + 1) // 2
@@ -17,7 +20,8 @@ TILE = 64
 # A pivot below this part of its diagonal element: the remaining states do not determine the pixel.
 SMALLEST_PIVOT = 1e-9
 
-_jit = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+_EXACT: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "nsz"}}
+_jit = compiled(**_EXACT)
 
 
 @_jit
@@ -88,7 +92,32 @@ def _take_tile(normal, a, first, count):  # type: ignore[no-untyped-def]
             a[_at(i, i), t] = 100.0
 
 
-@_jit
+@in_parts
+def _at_once(normal: Array, right: Array, solution: Array, covariance: Array, part: slice) -> None:
+    row, column = np.tril_indices(ELEMENTS)
+    full = np.empty((normal[:, part].shape[1], ELEMENTS, ELEMENTS))
+    full[:, row, column] = full[:, column, row] = normal[:, part].T
+    bad = _is_singular(full)
+    full[bad] = np.eye(ELEMENTS)
+    inverse = np.linalg.inv(full)
+    inverse[bad] = np.nan
+    solution[:, part] = np.einsum("pij,jp->ip", inverse, right[:, part])
+    covariance[:, part] = inverse[:, row, column].T
+
+
+def _is_singular(full: Array) -> NDArray[np.bool_]:
+    """Where Cholesky's method meets a pivot that vanishes."""
+    lower, bad = np.zeros_like(full), np.zeros(len(full), bool)
+    for i in range(ELEMENTS):
+        rest = full[:, i:, i] - np.einsum("pkj,pj->pk", lower[:, i:, :i], lower[:, i, :i])
+        lost = ~(rest[:, 0] > SMALLEST_PIVOT * full[:, i, i])
+        bad |= lost
+        lower[:, i:, i] = rest / np.sqrt(np.where(lost, 1.0, rest[:, 0]))[:, None]
+        lower[lost, i, i] = 1.0
+    return bad
+
+
+@compiled(_at_once, **_EXACT)
 def solve_range(normal, right, solution, covariance, start, stop):  # type: ignore[no-untyped-def]
     """Solve normal . solution = right for pixels start..stop; covariance = inverse of normal, packed.
 

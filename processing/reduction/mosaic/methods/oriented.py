@@ -8,13 +8,14 @@ pass every kernel unchanged. The priors below were set on scenes that docs/studi
 """
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from processing.arrays import Image
-from processing.computing.compiling import njit
+from processing.computing.compiling import PART, compiled
 from processing.computing.filters import gaussian, separable
 from processing.computing.threads import for_ranges
 from processing.reduction.mosaic.layout import PAIRS, MosaicLayout
@@ -24,6 +25,7 @@ REACH = 4
 DIRECTIONS = 16
 #: Rows whose covariance is worked out at a time; an even number.
 ROWS = 128
+_ROWS_AT_ONCE = 16
 #: How much farther the scene is alike along an edge than across.
 STRETCH = 2.5
 
@@ -159,10 +161,25 @@ def _correlation(size: int = 512) -> NDArray[np.float64]:
     return np.asarray(found / found.max())
 
 
-_jit = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+_FAST: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz"}}
 
 
-@_jit
+def _windows(padded: Image) -> NDArray[np.float32]:
+    return np.lib.stride_tricks.sliding_window_view(padded, (2 * REACH + 1, 2 * REACH + 1))
+
+
+def _everywhere_at_once(columns: Image, kernel: Image, out: Image, first: int, last: int) -> None:
+    around = _windows(np.stack([*columns], axis=-1).reshape(columns.shape[1], -1))
+    # Few rows at a time, as their windows are copied.
+    for start in range(first, last, _ROWS_AT_ONCE):
+        for row, column in np.ndindex(2, 2):
+            part = np.s_[start + row : min(start + _ROWS_AT_ONCE, last) : 2, column::2]
+            values = around[part]
+            found = values.reshape(-1, kernel.shape[2]) @ kernel[row, column]
+            out[:, *part] = found.T.reshape(-1, *values.shape[:2])
+
+
+@compiled(_everywhere_at_once, **_FAST)
 def _everywhere(columns, kernel, out, first, last):  # type: ignore[no-untyped-def]
     """One kernel a position for some rows; `columns` are the padded frame's even and odd columns.
 
@@ -191,7 +208,18 @@ def _everywhere(columns, kernel, out, first, last):  # type: ignore[no-untyped-d
                     out[c, y, 2 * m + parity] = sums[c, m]
 
 
-@_jit
+def _along_edges_at_once(
+    padded: Image, kernels: Image, direction: NDArray[np.uint8], out: Image, first: int, last: int
+) -> None:
+    around = _windows(padded)
+    rows, columns = np.nonzero(direction[first:last])
+    for start in range(0, rows.size, PART):
+        y, x = rows[start : start + PART] + first, columns[start : start + PART]
+        kernel = kernels[direction[y, x], y % 2, x % 2]
+        out[:, y, x] = np.einsum("nt,ntc->cn", around[y, x].reshape(len(y), -1), kernel)
+
+
+@compiled(_along_edges_at_once, **_FAST)
 def _along_edges(padded, kernels, direction, out, first, last):  # type: ignore[no-untyped-def]
     """Do the pixels on edges again, each with the kernels of its direction and position."""
     side = 2 * REACH + 1
