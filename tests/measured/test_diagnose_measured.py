@@ -163,7 +163,7 @@ def test_wollaston_the_source_is_the_cause(public_files, configs, tmp_path):
     assert d.error_after.rms_percent <= d.error_before.rms_percent < 0.3
     assert d.captures[0].source_percent == pytest.approx(100 * np.std(total) / np.mean(total), rel=0.2)
     # The values hold for all states together, not only for each part that was held out.
-    whole = problem.undivided().sums(judged.found.space, judged.found.fit.values, derivatives=False)
+    whole = problem.undivided().sums(judged.solution.space, judged.solution.fit.values, derivatives=False)
     assert np.sqrt(whole.square.sum() / whole.count.sum()) < 0.003
 
 

@@ -69,5 +69,5 @@ def test_a_mean_off_the_valley_gives_way_to_the_minimum_near_by(space):
     samples = SimpleNamespace(mean=fit.mean, covariance=fit.covariance, probability=np.ones(2), best=state)
     off, on = (problem.sums(space, v).excess.sum() for v in (fit.mean, about))
     assert off > 10 * on
-    found = _posterior_of(problem, space, ((0,), (1,)), sets, samples=samples, about=about, others={})
+    found = _posterior_of(problem, space, ((0,), (1,)), sets, samples=samples, about=about, rivals={})
     assert problem.sums(space, found.values).excess.sum() < on

@@ -10,7 +10,7 @@ from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.captured.screening import screened
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.structure import residual
+from processing.diagnosis.instrument.structure import compute_residual
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
@@ -37,7 +37,7 @@ def read(path, configs) -> tuple[CaptureData, dict[str, float], float]:
         data = screened(read_capture(capture, model), model, lambda line: None)
     problem = InstrumentProblem(model, [data])
     fit = minimize(problem, Space(()), np.zeros(0))
-    tests = residual(problem, 0, Space(()), fit).tests
+    tests = compute_residual(problem, 0, Space(()), fit).tests
     return data, tests, float(1 + fit.sums.excess.sum() / fit.sums.freedom.sum())
 
 

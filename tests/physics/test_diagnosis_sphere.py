@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from processing.diagnosis.search.correction import solution
-from processing.diagnosis.search.posterior import posterior
+from processing.diagnosis.search.posterior import fit_posterior
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.data import read_surface
 from processing.diagnosis.surface.diagnose import SurfaceDiagnosis, as_wide_as_the_valley, diagnose_object
@@ -133,7 +133,7 @@ def test_an_index_where_little_is_polarized_has_an_honest_error(scene, configs, 
         data = read_surface(capture, declared.at(NM), scene.object.geometry, fault.material)
     problem = SurfaceProblem(declared.at(NM), [data])
     space = Space(tuple(c for c in problem.pool() if c.kind == "refractive_index"))
-    found = posterior(problem, space, (), np.zeros(2), say=lambda line: None)
+    found = fit_posterior(problem, space, (), np.zeros(2), say=lambda line: None)
     solved = solution(problem, found, Space(()), np.zeros(0))
     error = np.sqrt(np.diag(as_wide_as_the_valley(problem, found, solved)[1]))
     truth = np.array([fault.parameters["refractive_index"][n] for n in ("n", "k")])

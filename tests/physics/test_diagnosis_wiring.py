@@ -36,7 +36,7 @@ def test_a_mistake_is_told(configs, tmp_path, told, word, air):
     bench = TrueBench(dg=np.deg2rad(128.0), lp=np.deg2rad(-0.2))
     found = miswired(problem(tmp_path, configs, bench, told, air))
     assert found is not None
-    assert word in found.told
+    assert word in found.message
 
 
 @pytest.mark.parametrize("air", [True, False])
@@ -63,11 +63,11 @@ def test_the_filter_of_another_wavelength_is_told(configs, tmp_path, air):
     found = miswired(problem(tmp_path, configs, bench, lambda a: a, air), declared)
     if not air:
         # Retardances are what an unknown sample absorbs: nothing is told, and nothing wrong.
-        assert found is None or "451" in found.told
+        assert found is None or "451" in found.message
         return
     assert found is not None
-    assert "the light is of 451 nm, not of 662" in found.told
-    assert "wavelength_nm: 451" in found.told
+    assert "the light is of 451 nm, not of 662" in found.message
+    assert "wavelength_nm: 451" in found.message
 
 
 @pytest.mark.long
@@ -81,7 +81,7 @@ def test_a_mistake_is_told_where_the_train_has_nominal_values(configs, tmp_path)
     assert WholeBench(whole, lambda line: None).train_is_off
     found = miswired_train(whole)
     assert found is not None
-    assert "'psa' turns the other way" in found.told
+    assert "'psa' turns the other way" in found.message
     straight = problem(tmp_path / "straight", configs, bench, lambda a: a, air=True)
     straight.models, straight.model = whole.models, whole.model
     assert not WholeBench(straight, lambda line: None).train_is_off

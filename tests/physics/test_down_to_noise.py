@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.posterior import posterior
+from processing.diagnosis.search.posterior import fit_posterior
 from processing.diagnosis.search.space import Space, Sums
 from processing.effect import Effect, Parameter
 
@@ -88,8 +88,8 @@ def bench() -> tuple[Space, np.ndarray, np.ndarray, np.ndarray]:
 
 def found(bench: tuple[Space, np.ndarray, np.ndarray, np.ndarray], unlisted: float) -> tuple[set[str], float]:
     space, *acts = bench
-    out = posterior(Bench(*acts, unlisted), space, (), np.zeros(space.size), say=lambda line: None)
-    return {out.label(g).kind for g in out.there}, out.samples.best.unit
+    out = fit_posterior(Bench(*acts, unlisted), space, (), np.zeros(space.size), say=lambda line: None)
+    return {out.label(g).kind for g in out.free_groups}, out.samples.best.unit
 
 
 def test_causes_that_leave_nothing_are_found_together(bench):

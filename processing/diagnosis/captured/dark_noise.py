@@ -66,7 +66,7 @@ def without_noise_of_darks(
     residual, fit = u.astype(np.float32).T @ z / spread, inside.astype(np.float32).T @ z
     # Fit and residual share the dark error. Only a fit without it says what of the residual follows the light.
     centred = residual - residual.mean(axis=1, keepdims=True)
-    of_dark = _beside(residual, fit - inside.T @ in_light @ (size / spread * centred))
+    of_dark = _project_out(residual, fit - inside.T @ in_light @ (size / spread * centred))
     # A pixel with a hit, or a hot one, tells nothing of its dark frames.
     of_dark[np.abs(of_dark) > OUTSTANDING] = 0.0
     subtracted = np.zeros((len(y), of_dark.shape[1]), dtype=np.float32)
@@ -82,7 +82,7 @@ def _rows(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -
     return w if capture.header.sample.kind == "unknown" else w @ known_mueller(capture.header.sample).reshape(16, 1)
 
 
-def _beside(values: Array, light: Array) -> Array:
-    """What of values (B, P) of the pixels is neither alike in all of them nor follows their light (K, P)."""
+def _project_out(values: Array, light: Array) -> Array:
+    """Values (B, P) of the pixels without their mean and without the part that follows their light (K, P)."""
     basis = np.concatenate([np.ones_like(light[:1]), light])
     return np.asarray(values - (values @ np.linalg.pinv(basis)) @ basis, dtype=float)

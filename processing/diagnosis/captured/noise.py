@@ -169,7 +169,7 @@ def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
     white = Whitened.of(data, a, looked_at)
     if white.outside.shape[1] < FEWEST_FREE_FOR_NOISE:
         return None
-    projector = white.rest(np.ones(white.y.shape[1], dtype=bool))
+    projector = white.projector(np.ones(white.y.shape[1], dtype=bool))
     floor = np.repeat(data.floor, data.signal.shape[1])[data.row_counts] / white.level**2
     r, light, dark = np.full((3, len(projector), rows, width), np.nan)
     good = looked_at[part]
@@ -293,7 +293,7 @@ def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
     if not _alike_in_halves(y[:, dim], mean[dim], outside, 1 / data.conditions.full_scale):
         return None
     black, bright = outside.T @ level, outside.T @ y[:, lit].mean(axis=1, dtype=np.float64)
-    if not _is_there(black, noise, free):
+    if not _is_significant(black, noise, free):
         return None
     slope, light = float(bright @ black / (black @ black)), float(mean[lit].mean() / max(mean[dim].mean(), 1e-300))
     # Nearer to light than to an offset, which bright pixels follow once.
@@ -303,7 +303,7 @@ def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
     if np.sum((along.T @ black) ** 2) > MOSTLY * (black @ black):
         # A fault, of which to take off a part alone would hide the rest; it may go in steps of whole counts.
         black, bright = (v - along @ (along.T @ v) for v in (black, bright))
-        if not _is_there(black, noise, free - along.shape[1]):
+        if not _is_significant(black, noise, free - along.shape[1]):
             return None
     offsets = np.zeros(data.values_per_pixel)
     offsets[rows] = outside @ (black - bright / light)
@@ -328,9 +328,9 @@ def _dim_levels(y: NDArray[np.float32], count: float) -> tuple[Array, float]:
     return level, float(np.mean(clipped.var(axis=1) / y.shape[1] + rounding))
 
 
-def _is_there(seen: Array, noise: float, free: int) -> bool:
+def _is_significant(levels: Array, noise: float, free: int) -> bool:
     """Whether levels in `free` directions are more than their noise."""
-    return bool(seen @ seen >= noise * (free + NOISE_SURE * np.sqrt(2 * free)))
+    return bool(levels @ levels >= noise * (free + NOISE_SURE * np.sqrt(2 * free)))
 
 
 def _courses(data: CaptureData, outside: Array) -> Array:
@@ -374,13 +374,13 @@ def checked_noise(data: CaptureData, a: Array) -> CaptureData:
     jitter = black_jitter(data, a) if data.noise_known else None
     if jitter is not None:
         offsets, variance = jitter
-        notes.append(_in_counts("the black level is another one in every frame", variance, data))
+        notes.append(_noise_note("the black level is another one in every frame", variance, data))
         level = offsets.reshape(*data.signal.shape[:2], 1, 1)
         data = replace(data, signal=(data.signal - level).astype(np.float32))
     noise = detector_noise(data, a) if data.noise_known else None
     if noise is None:
         return replace(data, noise_told=tuple(notes))
-    shared = _mixed(noise)
+    shared = _shared_by_neighbours(noise)
     if shared.shown < 1:
         notes.append(
             f"neighbours share noise (correlation {noise.right:.2f} across, {noise.down:.2f} down): the images were "
@@ -391,7 +391,7 @@ def checked_noise(data: CaptureData, a: Array) -> CaptureData:
     lines, wide = _lines(shared, data), _wide(shared, data)
     for name, part in zip(("row", "column"), lines, strict=True):
         if part > 0:
-            notes.append(_in_counts(f"every {name} of a frame has an offset of its own", part, data))
+            notes.append(_noise_note(f"every {name} of a frame has an offset of its own", part, data))
     shot, dark = factors = noise_factors(noise, shared.shown, data.noise_estimated)
     white = None
     if not data.noise_estimated and factors != (1.0, 1.0):
@@ -404,13 +404,13 @@ def checked_noise(data: CaptureData, a: Array) -> CaptureData:
     )
 
 
-def _in_counts(what: str, variance: float, data: CaptureData) -> str:
-    return f"{what}, {np.sqrt(variance) * data.conditions.full_scale:.2g} counts rms"
+def _noise_note(text: str, variance: float, data: CaptureData) -> str:
+    return f"{text}, {np.sqrt(variance) * data.conditions.full_scale:.2g} counts rms"
 
 
-def _mixed(found: DetectorNoise) -> SharedNoise:
-    least = max(NOISE_ALIKE, NOISE_SURE * found.alike_error)
-    return SharedNoise(*(_part(alike) if alike > least else 0.0 for alike in (found.right, found.down)))
+def _shared_by_neighbours(noise: DetectorNoise) -> SharedNoise:
+    least = max(NOISE_ALIKE, NOISE_SURE * noise.alike_error)
+    return SharedNoise(*(_part(alike) if alike > least else 0.0 for alike in (noise.right, noise.down)))
 
 
 def _part(alike: float) -> float:
@@ -440,44 +440,44 @@ def _lines(shared: SharedNoise, data: CaptureData) -> tuple[float, float]:
     return shared.rows * usual, shared.columns * usual
 
 
-def noise_factors(found: DetectorNoise, shown: float, estimated: bool) -> tuple[float, float]:
+def noise_factors(noise: DetectorNoise, shown: float, estimated: bool) -> tuple[float, float]:
     """Factors on the variance with and without light; one where the images agree with what is declared."""
-    factors = np.array([found.shot, found.dark]) / shown
-    white = found.white / shown
-    inverse = np.asarray(np.linalg.inv(found.covariance / shown**2), dtype=float)
+    factors = np.array([noise.shot, noise.dark]) / shown
+    white = noise.white / shown
+    inverse = np.asarray(np.linalg.inv(noise.covariance / shown**2), dtype=float)
     if estimated:
-        return _balanced(found, white, max(float(factors[1]), SMALL))
+        return _balanced(noise, white, max(float(factors[1]), SMALL))
     usual = 1.0, 1.0
-    bent = found.bent
+    bent = noise.bent
     least = NOISE_OFF if shown == 1 else NOISE_OFF_MIXED
     far = not min(bent, 1.0) - least < white < max(bent, 1.0) + least
-    if _against(factors, usual, inverse) < NOISE_SURE**2 or not (far or _dark_is_off(found, shown)):
+    if _distance(factors, usual, inverse) < NOISE_SURE**2 or not (far or _dark_is_off(noise, shown)):
         return usual
     # As simple as the images allow: another gain, another read noise, both.
     scales = np.geomspace(1 / MOST_GAIN, MOST_GAIN, GAINS)
-    gain = min(((s, s**2) for s in scales), key=lambda p: _against(factors, p, inverse))
+    gain = min(((s, s**2) for s in scales), key=lambda p: _distance(factors, p, inverse))
     darks = np.geomspace(LEAST_DARK_FACTOR, MOST_DARK_FACTOR, DARKS)
-    read = min(((1.0, d) for d in darks), key=lambda p: _against(factors, p, inverse))
-    simple = min(gain, read, key=lambda p: _against(factors, p, inverse))
-    if _against(factors, simple, inverse) < SHOWN**2:
+    read = min(((1.0, d) for d in darks), key=lambda p: _distance(factors, p, inverse))
+    simple = min(gain, read, key=lambda p: _distance(factors, p, inverse))
+    if _distance(factors, simple, inverse) < SHOWN**2:
         return float(simple[0]), float(simple[1])
-    return _balanced(found, white, max(float(factors[1]), SMALL))
+    return _balanced(noise, white, max(float(factors[1]), SMALL))
 
 
-def _against(both: Array, told: tuple[float, float], inverse: Array) -> float:
-    off = both - np.array(told)
+def _distance(factors: Array, expected: tuple[float, float], inverse: Array) -> float:
+    off = factors - np.array(expected)
     return float(off @ inverse @ off)
 
 
-def _dark_is_off(found: DetectorNoise, shown: float) -> bool:
-    return abs(found.dark / shown - 1) > max(
-        DARK_NOISE_OFF, NOISE_SURE * float(np.sqrt(found.covariance[1, 1])) / shown
+def _dark_is_off(noise: DetectorNoise, shown: float) -> bool:
+    return abs(noise.dark / shown - 1) > max(
+        DARK_NOISE_OFF, NOISE_SURE * float(np.sqrt(noise.covariance[1, 1])) / shown
     )
 
 
-def _balanced(found: DetectorNoise, white: float, dark: float) -> tuple[float, float]:
+def _balanced(noise: DetectorNoise, white: float, dark: float) -> tuple[float, float]:
     """Both factors with the whole as found, which is known best."""
-    light = found.light_share
+    light = noise.light_share
     shot = (white - dark * (1 - light)) / light if light > SMALL else 1.0
     return (shot, dark) if shot > 0 else (white, white)
 

@@ -90,7 +90,7 @@ class Whitened:
         variance /= (level[:, None] ** 2).astype(np.float32)
         return cls(y, variance, level, *inside_and_outside(a[keep] / level[:, None]))
 
-    def rest(self, clean: NDArray[np.bool_]) -> Array:
+    def projector(self, clean: NDArray[np.bool_]) -> Array:
         """Projection (L, L) on what neither the model reaches nor the residual of the `clean` pixels has in common."""
         outside = self.outside.astype(np.float32)
         r = outside @ (outside.T @ (self.y if clean.all() else self.y[:, clean]))
@@ -144,7 +144,7 @@ def bad_frames(data: CaptureData, a: Array) -> tuple[BadFrame, ...]:
         after = moments.suspect(subset)
         if after is None or before.misfit < LEAST_MISFIT or before.misfit**2 < AGAINST_NEXT * after.misfit**2:
             break
-        if moments.left(subset) > (1 - MOSTLY) * moments.left(state_indices):
+        if moments.excess(subset) > (1 - MOSTLY) * moments.excess(state_indices):
             break
         bad.append(before)
         state_indices, before = subset, after
@@ -169,7 +169,7 @@ class _Moments:
         rows = self._rows(states)
         return self._outside(rows), self._products[np.ix_(rows, rows)] - np.diag(self._noise[rows])
 
-    def left(self, states: Sequence[int]) -> float:
+    def excess(self, states: Sequence[int]) -> float:
         """Mean square beyond noise that a fit to some states leaves, summed over the states."""
         p, beyond = self._fitted(states)
         return max(float(np.sum(p * beyond)), 1e-300)
@@ -195,7 +195,7 @@ class _Moments:
     def exchanged(self, states: Sequence[int]) -> tuple[BadFrame, ...]:
         """The two of which each fits in the other's place, and most of what is left over goes; or none."""
         p, beyond = self._fitted(states)
-        least, pair = (1 - MOSTLY) * self.left(states), None
+        least, pair = (1 - MOSTLY) * self.excess(states), None
         where = np.arange(len(p)).reshape(len(states), self._channels)
         worst = np.argsort(-np.diag(p @ beyond @ p).reshape(where.shape).sum(axis=1))[:SUSPECTS_OF_EXCHANGE]
         for i, j in combinations(sorted(worst.tolist()), 2):
@@ -242,7 +242,7 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
     clean = np.ones(white.y.shape[1], dtype=bool)
     # Twice: what was struck is no structure of the image.
     for _ in range(2):
-        projector = white.rest(clean)
+        projector = white.projector(clean)
         # In standard deviations as the image itself shows them: what is declared of the noise is not asked.
         r = np.asarray(projector.astype(np.float32) @ white.y / np.sqrt(usual), dtype=np.float32)
         t = np.asarray(r / share, dtype=np.float32)
@@ -263,18 +263,18 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
 
 
 def _hits(
-    r: NDArray[np.float32], t: NDArray[np.float32], noise: NDArray[np.float32], rest: Array
+    r: NDArray[np.float32], t: NDArray[np.float32], noise: NDArray[np.float32], projector: Array
 ) -> tuple[NDArray[np.bool_], Array]:
     """Hits (L, P), and the mean square (P,) of what is left beside them, in standard deviations.
 
     A hit shows in all states through the fit: the strongest is left out of the fit, and the next is looked for.
-    `r` (L, P): residuals as `rest` gives them, over the noise of the usual state of the pixel; `noise` (L, P): that of
-    each state over it; `t` (L, P): residuals in standard deviations.
+    `r` (L, P): residuals of `projector` over the noise of the usual state of the pixel; `noise` (L, P): that of each
+    state over it; `t` (L, P): residuals in standard deviations.
     """
     hits = np.zeros(t.shape, dtype=bool)
     noisy = np.asarray(np.mean(t**2, axis=0, dtype=float))
     for p in np.flatnonzero(np.max(np.abs(t), axis=0) > HIT):
-        residual, q = r[:, p].astype(float), rest.copy()
+        residual, q = r[:, p].astype(float), projector.copy()
         struck: list[int] = []
         selection: tuple[list[int], float] = ([], float(noisy[p]))
         while len(struck) < MOST_STRUCK:
@@ -299,12 +299,12 @@ def _noisier_than_around(noisy: Array, free: int) -> NDArray[np.bool_]:
     return np.asarray(noisy > least * np.maximum(around, np.median(noisy)))
 
 
-def without(data: CaptureData, found: Outliers) -> CaptureData:
+def without(data: CaptureData, outliers: Outliers) -> CaptureData:
     """The capture with the pixels of outliers left out, and their counts filled in from the pixels around.
 
     A pixel is left out whole, since the moments need all its states; what is filled in serves image derivatives.
     """
-    every = found.hits | found.bad
+    every = outliers.hits | outliers.bad
     signal = data.signal.copy()
     box = np.ones((3, 3), dtype=np.float32)
     for n, c in np.argwhere(every.any(axis=(2, 3))):

@@ -53,7 +53,7 @@ def without_steep_pixels(data: CaptureData) -> CaptureData:
 
 def _lost_by_moving(data: CaptureData) -> Array:
     """Squared change of each pixel (rows, columns), over its variance and beyond what noise gives; mean of frames."""
-    change = _there_and_back(TRIED_PX / data.binned)
+    change = _round_trip(TRIED_PX / data.binned)
     change[FELT_PX] -= 1
     frames = data.signal.reshape(-1, *data.signal.shape[2:])
     slope, floor = (np.repeat(x, data.signal.shape[1]) for x in (data.slope, data.floor))
@@ -66,7 +66,7 @@ def _lost_by_moving(data: CaptureData) -> Array:
     return np.asarray(total / len(frames) - 2 * np.sum(change**2))
 
 
-def _there_and_back(shift_px: float) -> Array:
+def _round_trip(shift_px: float) -> Array:
     """Weights of 2 `FELT_PX` + 1 neighbours along one axis."""
     kernel = np.convolve(taps(shift_px), taps(-shift_px))
     middle = kernel.size // 2

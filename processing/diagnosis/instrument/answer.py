@@ -36,13 +36,13 @@ def closure(problem: InstrumentProblem, k: int, space: Space, values: Array) -> 
     return float(100 * means.sum() / (np.abs(means).sum() / 2))
 
 
-def calibrated(problem: InstrumentProblem, found: Posterior, solved: Solution) -> dict[str, EffectParameter]:
+def calibrated(problem: InstrumentProblem, posterior: Posterior, solved: Solution) -> dict[str, EffectParameter]:
     """Nominal values as fitted: one number, or one for each wavelength where they differ."""
-    part = dict(found.space.pairs)
+    part = dict(posterior.space.pairs)
     values: dict[str, dict[float, tuple[float, float]]] = {}
     nominal = {c: p for c, p in solved.base.pairs if c.place}
     for candidate, where in nominal.items():
-        covariance = found.covariance[part[candidate], part[candidate]]
+        covariance = posterior.covariance[part[candidate], part[candidate]]
         for single, (fitted,), ((variance,),) in candidate.by_wavelength(solved.fit.values[where], covariance):
             for model, wavelength in zip(problem.models, problem.wavelengths_nm, strict=True):
                 if single.wavelength_nm in (None, wavelength):

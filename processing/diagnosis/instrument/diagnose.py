@@ -17,8 +17,8 @@ from processing.diagnosis.instrument.doubts import doubts, testable
 from processing.diagnosis.instrument.mueller_error import MuellerErrors, chances, lasts
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
-from processing.diagnosis.instrument.structure import Residual, descriptions, residual
-from processing.diagnosis.instrument.whole_bench import WholeBench, predicts
+from processing.diagnosis.instrument.structure import Residual, compute_residual, descriptions
+from processing.diagnosis.instrument.whole_bench import WholeBench, validation_problem
 from processing.diagnosis.instrument.wiring import Wiring, miswired, miswired_train
 from processing.diagnosis.search.causes import causes, would_be_seen
 from processing.diagnosis.search.correction import solution
@@ -28,7 +28,7 @@ from processing.diagnosis.search.names import Names
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, FoundEffect
 from processing.diagnosis.search.rules import FAR_OFF, LIKELY, OUTSTANDING, SHARES
-from processing.diagnosis.tell.answer import Answer, checks, told_switches, unobservable
+from processing.diagnosis.tell.answer import Answer, checks, effects_of_switches, unobservable
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture, CaptureError
 
@@ -39,29 +39,29 @@ class Outcome:
 
     Attributes
     ----------
-    structure : whether any test sees structure in what the mean of the posterior leaves; left : chi-square of it.
+    structure : whether any test sees structure in what the mean of the posterior leaves; excess : chi-square of it.
     """
 
     bench: WholeBench
-    asked: InstrumentProblem
-    found: Posterior
+    validation: InstrumentProblem
+    posterior: Posterior
     solved: Solution
     before: tuple[Residual, ...]
     after: tuple[Residual, ...]
     structure: bool
-    left: float
+    excess: float
 
 
-def outcome_of(bench: WholeBench, found: Posterior) -> Outcome:
+def outcome_of(bench: WholeBench, posterior: Posterior) -> Outcome:
     """Test what a posterior leaves."""
-    problem = predicts(bench.problem)
-    unfit = bench.as_many_as_intensities(found, SHARES)
-    solved = solution(problem, found, bench.base, bench.base.vector(bench.start), unfit=unfit)
+    problem = validation_problem(bench.problem)
+    unfit = bench.as_many_as_intensities(posterior, SHARES)
+    solved = solution(problem, posterior, bench.base, bench.base.vector(bench.start), unfit=unfit)
     captures = range(len(problem.captures))
-    before = tuple(residual(problem, k, solved.base, solved.before_fit) for k in captures)
-    after = tuple(residual(problem, k, solved.space, solved.fit) for k in captures)
-    excess = sum(left_of(problem, r) for r in after)
-    return Outcome(bench, problem, found, solved, before, after, has_structure(problem, after), excess)
+    before = tuple(compute_residual(problem, k, solved.base, solved.before_fit) for k in captures)
+    after = tuple(compute_residual(problem, k, solved.space, solved.fit) for k in captures)
+    excess = sum(structure_chi2(problem, r) for r in after)
+    return Outcome(bench, problem, posterior, solved, before, after, has_structure(problem, after), excess)
 
 
 def has_structure(problem: InstrumentProblem, after: Collection[Residual]) -> bool:
@@ -71,9 +71,9 @@ def has_structure(problem: InstrumentProblem, after: Collection[Residual]) -> bo
     return any(not white(r) for r in after)
 
 
-def left_of(problem: InstrumentProblem, r: Residual) -> float:
+def structure_chi2(problem: InstrumentProblem, r: Residual) -> float:
     """Chi-square of the structure of one capture; none where no test sees any: of many some err by two deviations."""
-    return r.left if has_structure(problem, [r]) else 0.0
+    return r.excess if has_structure(problem, [r]) else 0.0
 
 
 def white(r: Residual) -> bool:
@@ -88,13 +88,13 @@ def white(r: Residual) -> bool:
 
 def names_of(outcome: Outcome) -> Names:
     """Names of the causes of a posterior, as far as what is left over allows them."""
-    problem, posterior, solved = outcome.asked, outcome.found, outcome.solved
-    likely = tuple(c for c in causes(posterior, outcome.left) if c.probability >= LIKELY)
+    problem, posterior, solved = outcome.validation, outcome.posterior, outcome.solved
+    likely = tuple(c for c in causes(posterior, outcome.excess) if c.probability >= LIKELY)
     untold = tuple(c for c in likely if c.candidates[0].effect.per_state and not testable(problem, solved, c, likely))
     named = tuple(c for c in likely if c not in untold)
     # What as many values as the data have took away may be any structure.
-    excess = outcome.left + sum(2 * c.log_odds * posterior.samples.best.unit for c in untold)
-    return Names(named, doubts(problem, posterior, solved, named, left=excess), untold)
+    excess = outcome.excess + sum(2 * c.log_odds * posterior.samples.best.unit for c in untold)
+    return Names(named, doubts(problem, posterior, solved, named, chi2=excess), untold)
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Judged:
 
     diagnosis: Diagnosis
     problem: InstrumentProblem
-    found: Solution
+    solution: Solution
     before: tuple[Residual, ...]
     after: tuple[Residual, ...]
     explained: tuple[Residual, ...]
@@ -118,18 +118,18 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
 
     `declared` is the instrument at all the wavelengths of its file.
     """
-    wiring, bench = _wired(problem, say, declared)
+    wiring, bench = _rewire(problem, say, declared)
     posterior = bench.run()
     say("testing what is left over")
     used = outcome_of(bench, posterior)
-    return _told(used, names_of(used), told_switches(used.asked, used.solved), wiring)
+    return _judge(used, names_of(used), effects_of_switches(used.validation, used.solved), wiring)
 
 
-def _wired(problem: InstrumentProblem, say: Say, declared: InstrumentModel | None) -> tuple[Wiring | None, WholeBench]:
+def _rewire(problem: InstrumentProblem, say: Say, declared: InstrumentModel | None) -> tuple[Wiring | None, WholeBench]:
     """The bench without a mistake of wiring, and which one that was."""
     wiring = miswired(problem, declared)
     if wiring is not None:
-        say(wiring.told)
+        say(wiring.message)
         problem = wiring.problem
     bench = WholeBench(problem, say)
     if not bench.train_is_off:
@@ -138,13 +138,13 @@ def _wired(problem: InstrumentProblem, say: Say, declared: InstrumentModel | Non
     wiring = miswired_train(problem, declared)
     if wiring is None:
         return None, bench
-    say(wiring.told)
+    say(wiring.message)
     return wiring, WholeBench(wiring.problem, say)
 
 
-def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: Wiring | None) -> Judged:
-    problem, predicted, posterior, solved = used.bench.problem, used.asked, used.found, used.solved
-    errors = MuellerErrors.of(predicted, posterior, solved)
+def _judge(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: Wiring | None) -> Judged:
+    problem, validation, posterior, solved = used.bench.problem, used.validation, used.posterior, used.solved
+    errors = MuellerErrors.of(validation, posterior, solved)
     now, later, of_each = errors.changes(solved)
     each = dict(zip((c.name for c in problem.captures), of_each, strict=True)) if len(of_each) > 1 else {}
     lasting = lasts(later, names.doubt.values())
@@ -152,23 +152,23 @@ def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: 
         named=bool(names.named or switched or posterior.any_cause),
         sure=bool(names.sure or switched),
         structure=used.structure or bool(names.untold),
-        seen=bool(would_be_seen(posterior)),
-        figures=checks(predicted, solved),
+        observable=bool(would_be_seen(posterior)),
+        figures=checks(validation, solved),
         # Where there is nothing to apply, nothing is said of what it would do.
         chances=chances(now, later, lasting, each) if solved.effects else (),
-        first=None if wiring is None else wiring.told,
+        first=None if wiring is None else wiring.message,
     )
-    answer = Answer(predicted, posterior, solved, names, judgement, switched)
-    final, unseen = answer.kept, unobservable(used.bench.whole, posterior)
+    answer = Answer(validation, posterior, solved, names, judgement, switched)
+    final, unseen = answer.applied, unobservable(used.bench.whole, posterior)
     # Values that are merely nominal are nowhere near what is true.
     nominal = any(c.place for c in solved.base.candidates)
     is_known = judgement.refused is None or not nominal or (judgement.first is None and solved.before.rms < FAR_OFF)
     diagnosis = Diagnosis(
-        **answer.told(
+        **answer.fields(
             recommended=lambda: recommended(problem, final.space, final.fit, names.rivals, unseen=missing(unseen)),
-            descriptions=descriptions([c.name for c in predicted.captures], used.after),
+            descriptions=descriptions([c.name for c in validation.captures], used.after),
             captures=[
-                capture_report(predicted, k, final, before, after=after)
+                capture_report(validation, k, final, before, after=after)
                 for k, (before, after) in enumerate(zip(used.before, used.after, strict=True))
             ],
             unseen=unseen,

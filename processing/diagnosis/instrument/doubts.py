@@ -30,20 +30,20 @@ OF_THE_SAMPLE = "it differs from part to part of the image, which a source does 
 
 
 def doubts(
-    problem: InstrumentProblem, found: Posterior, solved: Solution, causes: Sequence[Cause], *, left: float
+    problem: InstrumentProblem, posterior: Posterior, solved: Solution, causes: Sequence[Cause], *, chi2: float
 ) -> dict[Cause, str]:
-    """Reasons by cause; a cause without one may be called by its name. `left` is the chi-square of structure."""
+    """Reasons by cause; a cause without one may be called by its name. `chi2` is that of structure."""
     out: dict[Cause, str] = {}
-    still = _standing(problem, solved, causes)
+    static = _static_shifts(problem, solved, causes)
     even = Evenness(problem, solved.space, solved.fit.values)
     for cause in causes:
-        reason = STANDS if cause in still else _of_itself(problem, solved, cause, causes=causes, even=even)
+        reason = STANDS if cause in static else _of_itself(problem, solved, cause, causes=causes, even=even)
         if reason is not None:
             out[cause] = reason
     # What is something else took away a part of what is left over.
     another = [c.log_odds for c, why in out.items() if why in ELSE and c.log_odds > STANDS_OUT]
-    left += 2 * found.samples.best.unit * sum(another)
-    return with_parts(found, causes, out, left=left, noise_known=problem.noise_known)
+    chi2 += 2 * posterior.samples.best.unit * sum(another)
+    return with_parts(posterior, causes, out, chi2=chi2, noise_known=problem.noise_known)
 
 
 def _of_itself(
@@ -71,7 +71,7 @@ def _of_itself(
     return None
 
 
-def _standing(problem: InstrumentProblem, solved: Solution, causes: Sequence[Cause]) -> list[Cause]:
+def _static_shifts(problem: InstrumentProblem, solved: Solution, causes: Sequence[Cause]) -> list[Cause]:
     """Shifts of which the edges show too little: an image that moves does so at its edges too."""
     shifts = [c for c in causes if c.candidates[0].moves_image]
     shifts = [c for c in shifts if all(candidate in solved.space.candidates for candidate in c.candidates)]

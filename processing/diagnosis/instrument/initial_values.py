@@ -57,12 +57,12 @@ class Branch:
     """
 
     values: Values
-    told: str | None
+    message: str | None
 
 
-def nearest_branch(problem: InstrumentProblem, found: Mapping[Candidate, Array]) -> Branch:
+def nearest_branch(problem: InstrumentProblem, estimates: Mapping[Candidate, Array]) -> Branch:
     """The values found, on the branch whose azimuths are nearest to the instrument file."""
-    values = _of_nominal_retardance(problem, found)
+    values = _of_nominal_retardance(problem, estimates)
     values = {c: _within_half_a_turn(c, v) if _is_azimuth(c) else v for c, v in values.items()}
     places = sorted({c.place for c in values if _is_azimuth(c)})
     excess = _excess(problem, values)
@@ -87,11 +87,11 @@ def nearest_branch(problem: InstrumentProblem, found: Mapping[Candidate, Array])
     )
 
 
-def _of_nominal_retardance(problem: InstrumentProblem, found: Mapping[Candidate, Array]) -> Values:
+def _of_nominal_retardance(problem: InstrumentProblem, estimates: Mapping[Candidate, Array]) -> Values:
     """The values with retardances nearest to the instrument file: that of d, -d and 360 - d, a quarter turn apart."""
-    values = dict(found)
+    values = dict(estimates)
     azimuths = {c.place.rpartition(".")[0]: c for c in values if _is_azimuth(c)}
-    for candidate, value in found.items():
+    for candidate, value in estimates.items():
         element, _, field = candidate.place.rpartition(".")
         if field != "retardance_deg" or candidate.curve is not None or not candidate.effect.is_nominal:
             continue
@@ -292,26 +292,26 @@ class _AtOne:
 
 
 def _pointed_to(
-    found: Mapping[int, Values], each: Sequence[_AtOne], k: int, neighbours: tuple[int, int]
+    solutions: Mapping[int, Values], each: Sequence[_AtOne], k: int, neighbours: tuple[int, int]
 ) -> dict[str, Array]:
     """Values by place at wavelength k, on the line through two neighbours over the reciprocal of the wavelength."""
-    near = {c.short: v for c, v in found[neighbours[0]].items()}
-    if neighbours[1] not in found:
+    near = {c.short: v for c, v in solutions[neighbours[0]].items()}
+    if neighbours[1] not in solutions:
         return near
-    far = {c.short: v for c, v in found[neighbours[1]].items()}
+    far = {c.short: v for c, v in solutions[neighbours[1]].items()}
     at, near_at, far_at = (1 / each[i].wavelength_nm for i in (k, *neighbours))
     share = (at - near_at) / (near_at - far_at)
     return {place: v + share * (v - far[place]) for place, v in near.items()}
 
 
-def _joined(space: Space, found: Sequence[Values]) -> Array:
+def _joined(space: Space, solutions: Sequence[Values]) -> Array:
     """Values of the common vector, of those at each wavelength in ascending order."""
     parts = []
     for candidate in space.candidates:
-        at = np.stack([v for each in found for c, v in each.items() if c.short == candidate.short])
+        at = np.stack([v for each in solutions for c, v in each.items() if c.short == candidate.short])
         if candidate.curve is not None:
             parts.append(candidate.curve.through(at))
         else:
-            matches = [v for each in found for c, v in each.items() if c == candidate]
+            matches = [v for each in solutions for c, v in each.items() if c == candidate]
             parts.append(matches[0])
     return np.concatenate(parts)

@@ -97,7 +97,7 @@ class Moments:
     ----------
     tiles, clipped : of pixels without and with a clipped state; None where states are held out.
     counts : (L,) rows of W that count.
-    sigma : (L,) noise of each row in the weighted units; left : (L,) part of its variance that the pixels show.
+    sigma : (L,) noise of each row in the weighted units; shown : (L,) part of its variance that the pixels show.
     relative : turns a weighted square into a square relative to the mean signal.
     spread : mean square over squared mean of the variances: 1 if all pixels and states are equally noisy.
     noise_floor : rms noise over the mean signal.
@@ -108,7 +108,7 @@ class Moments:
     clipped: Tiles | None
     counts: NDArray[np.bool_]
     sigma: Array
-    left: Array
+    shown: Array
     relative: float
     spread: float
     noise_floor: float
@@ -166,7 +166,7 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
         clipped=clipped_tiles,
         counts=counts,
         sigma=sigma,
-        left=share,
+        shown=share,
         relative=float(np.mean(pixels.scale[pixels.good])) / mean**2,
         spread=float(np.mean(means.share_square[counts] / sigma[counts] ** 4)),
         noise_floor=noise_floor,

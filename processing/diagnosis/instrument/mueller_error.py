@@ -39,15 +39,15 @@ ELEMENTS = 15
 
 
 def mueller_slopes(
-    problem: InstrumentProblem, space: Space, values: Array, left: Array | None = None
+    problem: InstrumentProblem, space: Space, values: Array, rms: Array | None = None
 ) -> Iterator[tuple[NDArray[np.int64], Array]]:
     """Of each capture: the J values that act on it, and products (16, J, J) of the slopes of each element of M/m00.
 
     A common factor of M is left out. Products are means over the elements, and over the pixels by their brightness.
-    `left` (captures,) is what the intensities of each are known to, in units of noise (default: 1). What they do not
+    `rms` (captures,) is what the intensities of each are known to, in units of noise (default: 1). What they do not
     tell of M, within the size of its elements, is not made wrong by an instrument either.
     """
-    left = np.ones(len(problem.captures)) if left is None else left
+    rms = np.ones(len(problem.captures)) if rms is None else rms
     problem, values = problem.near(space, values)
     for k, moments in enumerate(problem.moments):
         acting = space.acting(k, problem.wavelengths_nm[k])
@@ -63,7 +63,7 @@ def mueller_slopes(
             y = np.einsum("fl,flr->lr", c, block.z) * scale
             m00 = (vt[:, 0] / size) @ (u.T @ y)
             # The best linear estimate of elements that are as large as m00 at most.
-            unknown = left[k] ** 2 * block.pixels / max(float(m00 @ m00), 1e-300)
+            unknown = rms[k] ** 2 * block.pixels / max(float(m00 @ m00), 1e-300)
             back = (vt.T * (size / (size**2 + unknown))) @ u.T
             m = back @ y
             if problem.has_free_level(k):
@@ -122,17 +122,17 @@ class MuellerErrors:
     of_captures: tuple[tuple[NDArray[np.int64], Array], ...]
 
     @classmethod
-    def of(cls, problem: InstrumentProblem, found: Posterior, solved: Solution) -> MuellerErrors:
+    def of(cls, problem: InstrumentProblem, posterior: Posterior, solved: Solution) -> MuellerErrors:
         """Of a posterior, with slopes where its mean is; `solved` says to what the intensities are known."""
-        chosen = [k for k, c in enumerate(found.space.candidates) if _moves_mueller(found, k, c in solved.effects)]
-        space = Space(tuple(found.space.candidates[k] for k in chosen))
-        index = found.space.positions(chosen)
-        values, captures = found.values[index], len(problem.captures)
+        chosen = [k for k, c in enumerate(posterior.space.candidates) if _moves_m(posterior, k, c in solved.effects)]
+        space = Space(tuple(posterior.space.candidates[k] for k in chosen))
+        index = posterior.space.positions(chosen)
+        values, captures = posterior.values[index], len(problem.captures)
         products, each = np.zeros((16, index.size, index.size)), []
-        for acting, part in mueller_slopes(problem, space, values, _left(problem, solved)):
+        for acting, part in mueller_slopes(problem, space, values, _residual_rms(problem, solved)):
             products[:, acting[:, None], acting] += part / captures
             each.append((acting, part.sum(axis=0)))
-        return cls(space, values, found.covariance[np.ix_(index, index)], products, tuple(each))
+        return cls(space, values, posterior.covariance[np.ix_(index, index)], products, tuple(each))
 
     def given(self, used: Solution) -> Array:
         """Values (K,) that a correction applies."""
@@ -148,8 +148,8 @@ class MuellerErrors:
             tuple(self._change(index, correction, part) for index, part in self.of_captures),
         )
 
-    def _change(self, own: NDArray[np.int64], given: Array, products: Array) -> PredictedChange:
-        return predicted_change(given[own], self.values[own], self.covariance[np.ix_(own, own)], products)
+    def _change(self, index: NDArray[np.int64], correction: Array, products: Array) -> PredictedChange:
+        return predicted_change(correction[index], self.values[index], self.covariance[np.ix_(index, index)], products)
 
     def _of(self, scope: str) -> NDArray[np.bool_]:
         return np.array([c.scope == scope for c in self.space.candidates for _ in c.parameters], dtype=bool)
@@ -187,7 +187,7 @@ class MuellerErrors:
         return stored, MuellerError(elements=elements, rms=rms, most=most)
 
 
-def _left(problem: InstrumentProblem, solved: Solution) -> Array:
+def _residual_rms(problem: InstrumentProblem, solved: Solution) -> Array:
     """What is left over of each capture (captures,) after the correction, in units of its noise; noise at least."""
     noise = np.array([m.noise_floor for m in problem.moments])
     rms = np.array([solved.after.of(k).rms for k in range(noise.size)])
@@ -209,17 +209,17 @@ def _leading(covariance: Array, products: Array, lasts: NDArray[np.bool_]) -> tu
     return np.maximum(size[::-1], 0.0), (root @ turn)[:, ::-1]
 
 
-def _moves_mueller(found: Posterior, k: int, applied: bool) -> bool:
+def _moves_m(posterior: Posterior, k: int, applied: bool) -> bool:
     """Whether a candidate may make M wrong by values that do not differ over the image."""
-    candidate = found.space.candidates[k]
+    candidate = posterior.space.candidates[k]
     # Levels of a source are projected out by each reduction, which carries their errors itself.
     if candidate.effect.varies_over_image or candidate.effect.is_switch or candidate.effect.is_projected:
         return False
-    spread = np.diag(found.covariance)[found.space.slices[k]]
+    spread = np.diag(posterior.covariance)[posterior.space.slices[k]]
     if applied or not candidate.state_chosen:
         return applied or bool(spread.any())
-    group = next(g for g, members in enumerate(found.members) if k in members)
-    return bool(found.samples.probability[group] > TAKES_PART)
+    group = next(g for g, members in enumerate(posterior.members) if k in members)
+    return bool(posterior.samples.probability[group] > TAKES_PART)
 
 
 def _as_effects(space: Space, direction: Array, size: Array, names: tuple[str, ...]) -> tuple[AppliedEffect, ...]:
@@ -261,14 +261,14 @@ def _values_alone(parameters: dict[str, EffectParameter]) -> dict[str, EffectPar
 
 
 def chances(
-    here: PredictedChange, later: PredictedChange, lasting: bool, each: Mapping[str, PredictedChange]
+    now: PredictedChange, later: PredictedChange, lasting: bool, each: Mapping[str, PredictedChange]
 ) -> tuple[Check, ...]:
     """Error of M as the posterior expects it, and the chance that it grows: an explanation may be too vague to use.
 
     Of all captures together it decides. Of `each` of several it is told: a sample that hardly polarizes gains little
     and may lose. What is too vague for later captures is written for these alone (`lasts`).
     """
-    predicted, grows = chance_checks("M/m00", here)
+    predicted, grows = chance_checks("M/m00", now)
     alone = "" if lasting else ", so it is written for these captures alone"
     return (
         predicted,

@@ -43,7 +43,7 @@ def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new
             # What is undone stretches the residual with the counts; their noise is that of counts as they were stored.
             _, slope = undoing(still, undone_here)(still.signal.astype(float))
             residual /= np.broadcast_to(slope, still.signal.shape).reshape(residual.shape)
-        share, good = free * near.moments[k].left, data.usable & ~data.clipped
+        share, good = free * near.moments[k].shown, data.usable & ~data.clipped
         before, after = (
             _log_scatter(still, residual, share, near.moments[k].counts, good=good, correct=undoing(still, undone))
             for undone in ({}, new)
@@ -54,7 +54,7 @@ def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new
 
 
 def _log_scatter(
-    still: CaptureData, rest: NDArray[np.float32], share: Array, use: BoolArray, *, good: BoolArray, correct: Correct
+    still: CaptureData, r: NDArray[np.float32], share: Array, use: BoolArray, *, good: BoolArray, correct: Correct
 ) -> float:
     """Minus twice the log likelihood of the scatter of a residual (L, rows, columns), with noise of corrected counts.
 
@@ -63,7 +63,7 @@ def _log_scatter(
     sums = np.zeros(len(good))
 
     def strip(rows: slice) -> None:
-        part = rest[:, rows].astype(float)
+        part = r[:, rows].astype(float)
         light = still.signal[:, :, rows] - part.reshape(still.signal[:, :, rows].shape)
         variance = still.noise_of(*correct(light)).reshape(part.shape)
         # Of neighbours: what both have in common is no noise, but what the fit does not explain.

@@ -86,14 +86,14 @@ def with_noise_of_light(data: CaptureData, a: Array, bends: Mapping[Candidate, A
     return _of_light(_scaled(data, factors, _level(noise)), bends)
 
 
-def _level(found: DetectorNoise) -> tuple[float, float]:
+def _level(noise: DetectorNoise) -> tuple[float, float]:
     """How much larger the noise with and without light is than is stated: the mean under what labs know of both.
 
     A constant offset that nothing else shows changes the noise without light alone.
     """
     common, dark = (GAIN_OFF / 2) ** 2, np.diag([0.0, DARK_NOISE_OFF**2])
     prior = common + dark
-    deviation = prior @ np.linalg.solve(prior + found.covariance, np.array([found.shot, found.dark]) - 1)
+    deviation = prior @ np.linalg.solve(prior + noise.covariance, np.array([noise.shot, noise.dark]) - 1)
     return float(np.clip(1 + deviation[0], 1 - NOISE_OFF, 1 + NOISE_OFF)), float(max(1 + deviation[1], LEAST_PART))
 
 

@@ -245,7 +245,7 @@ def add_parts(
     out.excess[fold] += squares.sum() - expected
     out.freedom[fold] += expected
     out.square[fold] += np.sum(squares * moments.sigma[rows] ** 2) * moments.relative
-    out.count[fold] += np.sum(free * moments.left[rows])
+    out.count[fold] += np.sum(free * moments.shown[rows])
 
 
 def noise_information(block: Block, a: Array, dc: Array, moments: Moments) -> Array:

@@ -179,7 +179,7 @@ def _extent(image: NDArray[np.floating]) -> tuple[float, float, float, float]:
 
 def _change(judged: Judged, problem: InstrumentProblem, k: int) -> tuple[Sequence[Sequence[str]], str]:
     """What the correction changes in the Mueller elements, and in xi0."""
-    first, second = (_mueller(problem, k, space, fit) for space, fit in judged.found.ends)
+    first, second = (_mueller(problem, k, space, fit) for space, fit in judged.solution.ends)
     if first is None or second is None:
         return (), "These states do not determine a Mueller matrix. The report gives no change of final quantities."
     difference = np.sqrt(np.mean((second - first) ** 2, axis=0)).reshape(4, 4)

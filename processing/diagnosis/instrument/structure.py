@@ -43,7 +43,7 @@ class Residual:
     harmonics : axis to amplitudes (HARMONICS,) of the state means, in units of the noise of one intensity.
     correlates : name to correlation of the rms map or of the residual with it.
     leading : (L,) leading component over the states, with its share of the sum of squares.
-    left : chi-square of the structure, as the test that finds most of it beyond two standard deviations has it.
+    excess : chi-square of the structure, as the test that finds most of it beyond two standard deviations has it.
     """
 
     image: NDArray[np.float32]
@@ -54,7 +54,7 @@ class Residual:
     correlates: dict[str, float]
     leading: Array
     leading_share: float
-    left: float = 0.0
+    excess: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Images:
     good: NDArray[np.bool_]
 
 
-def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -> Residual:
+def compute_residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -> Residual:
     """Residual of a capture at the values of a fit, pixel by pixel, and its tests."""
     problem, values = problem.near(space, fit.values)
     data, moments = problem.captures[capture], problem.moments[capture]
@@ -113,7 +113,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     good = np.asarray(np.isfinite(r).all(axis=0))
     images = Images(r, around, expected, good)
     alike = _alike(data)
-    tests, excess = _tests(images, moments.left, alike, a.shape[1], spread=moments.spread, noise_known=data.noise_known)
+    tests, chi2 = _tests(images, moments.shown, alike, a.shape[1], spread=moments.spread, noise_known=data.noise_known)
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
     states = mean.reshape(n, channels).mean(axis=1)
@@ -130,7 +130,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
         correlates=correlates_of(r, signal, good),
         leading=vector[:, -1],
         leading_share=float(value[-1] / max(value.sum(), 1e-300)),
-        left=excess,
+        excess=chi2,
     )
 
 
@@ -274,29 +274,29 @@ def correlates_of(r: NDArray[np.float32], signal: NDArray[np.float32], good: NDA
     return out
 
 
-def descriptions(names: Sequence[str], left: Sequence[Residual]) -> tuple[str, ...]:
+def descriptions(names: Sequence[str], residuals: Sequence[Residual]) -> tuple[str, ...]:
     """Sentences about what captures leave over, each with the name of its capture where there are several."""
     several = len(names) > 1
     return tuple(
         f"{name}: {line}" if several else line
-        for name, of_capture in zip(names, left, strict=True)
+        for name, of_capture in zip(names, residuals, strict=True)
         for line in description(of_capture)
     )
 
 
-def description(found: Residual) -> list[str]:
+def description(r: Residual) -> list[str]:
     """Sentences about what is left over; empty if nothing is."""
-    lines = in_words(found.tests)
+    lines = in_words(r.tests)
     if not lines:
         return []
-    order = np.argsort(-np.abs(found.mean))[:3]
+    order = np.argsort(-np.abs(r.mean))[:3]
     lines.append("states that are furthest off on average: " + ", ".join(str(int(k)) for k in order))
-    if found.leading_share > 0:
-        lines.append(f"the leading component over the states holds {100 * found.leading_share:.0f} % of what is left")
-    for axis, amplitudes in found.harmonics.items():
+    if r.leading_share > 0:
+        lines.append(f"the leading component over the states holds {100 * r.leading_share:.0f} % of what is left")
+    for axis, amplitudes in r.harmonics.items():
         h = int(np.argmax(amplitudes))
         lines.append(f"strongest harmonic of {axis}: {h + 1} a turn, {amplitudes[h]:.2g} of the noise of one intensity")
-    if found.correlates:
-        name = max(found.correlates, key=lambda k: abs(found.correlates[k]))
-        lines.append(f"its map goes with {name} (correlation {found.correlates[name]:+.2f})")
+    if r.correlates:
+        name = max(r.correlates, key=lambda k: abs(r.correlates[k]))
+        lines.append(f"its map goes with {name} (correlation {r.correlates[name]:+.2f})")
     return lines

@@ -299,12 +299,12 @@ def add_tiles(
     mine = np.searchsorted(columns, used)
     around = used >= len(FEATURES) - DERIVATIVES
 
-    def projected(fold: int, kept: slice) -> Iterator[tuple[NDArray[np.int64], Projected]]:
-        rows = use[kept]
-        scatter = noise[:, kept] if len(columns) == used.size else noise[:, kept, mine[:, None], mine]
+    def projected(fold: int, selection: slice) -> Iterator[tuple[NDArray[np.int64], Projected]]:
+        rows = use[selection]
+        scatter = noise[:, selection] if len(columns) == used.size else noise[:, selection, mine[:, None], mine]
         in_fold = np.flatnonzero(tiles.fold == fold)
         for some in np.split(in_fold, range(TILES_TOGETHER, in_fold.size, TILES_TOGETHER)):
-            features = z[some[:, None], mine, kept]
+            features = z[some[:, None], mine, selection]
             part = Projected(features, scatter[some], a[some][:, rows], c[None, used][:, :, rows], around=around)
             add_parts(part, moments, rows[None], tiles.pixels[some], fold=fold, out=out)
             yield some, part

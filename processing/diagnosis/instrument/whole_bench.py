@@ -16,7 +16,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.correction import applied
 from processing.diagnosis.search.fit import Fit, prior, score
 from processing.diagnosis.search.likely_set import everything
-from processing.diagnosis.search.posterior import Posterior, Say, posterior
+from processing.diagnosis.search.posterior import Posterior, Say, fit_posterior
 from processing.diagnosis.search.rules import EXACT, FAR_OFF, NEEDED, TAKES_PART
 from processing.diagnosis.search.space import Space
 from processing.instrument.elements import number
@@ -24,7 +24,7 @@ from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import CaptureError
 
 
-def predicts(problem: InstrumentProblem) -> InstrumentProblem:
+def validation_problem(problem: InstrumentProblem) -> InstrumentProblem:
     """The problem that is asked for held-out data: all of it where the parts have nothing left over."""
     sums = problem.sums(Space(()), np.zeros(0), derivatives=False)
     return problem if sums.freedom.min() > 0.5 and sums.count.min() > 0.5 else problem.undivided()
@@ -52,7 +52,7 @@ class WholeBench:
                 "could speak against the model. Take more states than the sample has unknowns, or a known sample."
             )
         branch = nearest_branch(self.whole, first_values(self.whole, self.base, self.pool, say))
-        self.start, self.branch = branch.values, branch.told
+        self.start, self.branch = branch.values, branch.message
         self._linearize_there()
 
     def _linearize_there(self) -> None:
@@ -61,7 +61,7 @@ class WholeBench:
         space = Space(tuple(azimuths))
         values = space.vector(self.start)
 
-        def there(k: int, model: InstrumentModel) -> InstrumentModel:
+        def shifted(k: int, model: InstrumentModel) -> InstrumentModel:
             acting = space.acting(k, self.whole.wavelengths_nm[k])
             shifts = zip(acting.space.candidates, acting.of(values), strict=True)
             new: dict[str, dict[str, float]] = {}
@@ -70,7 +70,7 @@ class WholeBench:
                 new.setdefault(candidate.place.rpartition(".")[0], {})["azimuth_deg"] = nominal + float(shift)
             return model.with_values(new)
 
-        models = [there(k, model) for k, model in enumerate(self.whole.models)]
+        models = [shifted(k, model) for k, model in enumerate(self.whole.models)]
         same = self.problem is self.whole
         self.whole = self.whole.with_models(models)
         self.problem = self.whole if same else self.problem.with_models(models)
@@ -102,12 +102,12 @@ class WholeBench:
             self.say(f"without {', '.join(c.label for c in too_many)}: it would be a value for each intensity")
             plain = [c for c in plain if c not in too_many]
             posterior = self._posterior([*fixed, *plain], fixed)
-        posterior = self._with_what_scatters_so(posterior, fixed)
+        posterior = self._without_refuted(posterior, fixed)
         fields = [c for c in self.pool if c.effect.varies_over_image]
         if fields and not self.whole.holds_out_states:
             # What the noise seemed to speak against may be right beside what varies over the image.
             with_fields = self._with_fields(posterior, fixed, plain, fields)
-            posterior = posterior if with_fields is posterior else self._with_what_scatters_so(with_fields, fixed)
+            posterior = posterior if with_fields is posterior else self._without_refuted(with_fields, fixed)
         # Behind a bent response the noise that counts should have is wrong by percents.
         if self.whole.noise_known and self._adopt_noise(*applied(posterior, self.base)):
             self.say("the same with the noise that this light has")
@@ -120,22 +120,22 @@ class WholeBench:
             self.problem.adopt_noise(space, values)
         return is_adopted
 
-    def _with_what_scatters_so(self, found: Posterior, fixed: Sequence[Candidate]) -> Posterior:
+    def _without_refuted(self, posterior: Posterior, fixed: Sequence[Candidate]) -> Posterior:
         """Without corrections of the counts whose light would scatter otherwise than the counts do.
 
         Unless nothing else explains the counts: then it is the noise that is not what is declared.
         """
         if not self.whole.noise_known:
-            return found
+            return posterior
         # Where one is gone another may stand in for it, and one that stood beside it may be right.
-        while against := self._refuted_by_scatter(*applied(found, self.base)):
+        while against := self._refuted_by_scatter(*applied(posterior, self.base)):
             worst = min(against, key=lambda c: against[c])
             self.say(f"the noise speaks against {worst.label}")
-            trial = self._posterior([c for c in found.space.candidates if c != worst], fixed, found)
-            if not trial.score > found.score + against[worst]:
+            trial = self._posterior([c for c in posterior.space.candidates if c != worst], fixed, posterior)
+            if not trial.score > posterior.score + against[worst]:
                 break
-            found = trial
-        return found
+            posterior = trial
+        return posterior
 
     def _refuted_by_scatter(self, space: Space, values: Array) -> dict[Candidate, float]:
         """Corrections of the counts that the noise speaks against, with the log likelihood that they lose."""
@@ -170,18 +170,18 @@ class WholeBench:
             return len(self.whole.model.channels) > 1
         return True
 
-    def as_many_as_intensities(self, found: Posterior, least: float) -> set[Candidate]:
+    def as_many_as_intensities(self, posterior: Posterior, least: float) -> set[Candidate]:
         """Values for each state, of a probability above `least`, that with the others are one for each intensity.
 
         What is held out says nothing of them. Several channels see the same source: that is the last to be doubted.
         Many pixels with known noise test them all.
         """
         per_state = [
-            found.space.candidates[m]
-            for g, p in enumerate(found.samples.probability)
+            posterior.space.candidates[m]
+            for g, p in enumerate(posterior.samples.probability)
             if p > least
-            for m in found.members[g]
-            if found.space.candidates[m].effect.per_state
+            for m in posterior.members[g]
+            if posterior.space.candidates[m].effect.per_state
         ]
         valid: list[Candidate] = []
         for candidate in sorted(per_state, key=lambda c: not c.effect.of_source):
@@ -208,7 +208,7 @@ class WholeBench:
         self, candidates: Sequence[Candidate], fixed: Sequence[Candidate], old: Posterior | None = None
     ) -> Posterior:
         space = Space(tuple(candidates))
-        return posterior(self.whole, space, fixed, self._values_at_start(space, old), say=self.say)
+        return fit_posterior(self.whole, space, fixed, self._values_at_start(space, old), say=self.say)
 
     def _values_at_start(self, space: Space, old: Posterior | None = None) -> Array:
         start = dict(self.start)
@@ -224,24 +224,24 @@ class WholeBench:
                 return [candidate]
         return []
 
-    def _least_unit(self, found: Posterior) -> float:
+    def _least_unit(self, posterior: Posterior) -> float:
         """Unit of chi-square with every group there: what varies over the image may be what hides the others."""
         if not self.whole.noise_known:
-            return found.samples.best.unit
-        return min(found.samples.best.unit, found.sets.settled(everything(found.sets)).unit)
+            return posterior.samples.best.unit
+        return min(posterior.samples.best.unit, posterior.sets.settled(everything(posterior.sets)).unit)
 
     def _with_fields(
-        self, found: Posterior, fixed: Sequence[Candidate], plain: Sequence[Candidate], fields: Sequence[Candidate]
+        self, posterior: Posterior, fixed: Sequence[Candidate], plain: Sequence[Candidate], fields: Sequence[Candidate]
     ) -> Posterior:
         """The posterior of all with values that vary over the image, if they promise something beside the others."""
-        space, values = applied(found, self.base)
-        unit = self._least_unit(found)
+        space, values = applied(posterior, self.base)
+        unit = self._least_unit(posterior)
         joint = Space((*space.candidates, *fields))
         sums = self.whole.sums(joint, np.append(values, np.zeros(joint.size - space.size)))
         parts = dict(joint.pairs)
         gains = {c: score(sums, space.size, parts[c], prior(joint))[0] / unit for c in fields}
         best = max(gains, key=lambda c: gains[c])
         if gains[best] < 2 * NEEDED:
-            return found
+            return posterior
         self.say(f"with {', '.join(c.label for c in fields)}")
         return self._posterior([*fixed, *plain, *fields], fixed)

@@ -35,14 +35,14 @@ GEARS = {"5 instead of 4.91": 5 / 4.91, "4.91 instead of 5": 4.91 / 5}
 class Wiring:
     """One mistake: what it is, what to change in the instrument or states file, and the problem without it."""
 
-    what: str
+    mistake: str
     change: str
     problem: InstrumentProblem
 
     @property
-    def told(self) -> str:
+    def message(self) -> str:
         """A sentence."""
-        return f"{self.what}: {self.change}"
+        return f"{self.mistake}: {self.change}"
 
 
 def miswired(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
@@ -56,16 +56,16 @@ def miswired(problem: InstrumentProblem, declared: InstrumentModel | None = None
         return None
     nothing, none = Space(()), np.zeros(0)
     mistakes = [*_mistakes(problem), *_other_wavelengths(problem, declared)]
-    wiring = _best(mistakes, [_left(w.problem, nothing, none) for w in mistakes], _left(problem, nothing, none))
+    wiring = _best(mistakes, [_chi2(w.problem, nothing, none) for w in mistakes], _chi2(problem, nothing, none))
     # Plates that are far off, or another mount, may come nearer to a mistake than to what is declared.
     return None if wiring is None or _fits_better(problem, wiring.problem) else wiring
 
 
-def _fits_better(problem: InstrumentProblem, other: InstrumentProblem) -> bool:
+def _fits_better(problem: InstrumentProblem, rewired: InstrumentProblem) -> bool:
     """Whether values of the train as it is declared leave far less than another train does as it stands."""
     space = Space(tuple(c for c in problem.pool() if c.shifts(problem.model)))
     values = minimize(problem, space, np.zeros(space.size)).values
-    return _left(problem, space, values) * WIRING < _left(other, Space(()), np.zeros(0))
+    return _chi2(problem, space, values) * WIRING < _chi2(rewired, Space(()), np.zeros(0))
 
 
 def miswired_train(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
@@ -73,18 +73,18 @@ def miswired_train(problem: InstrumentProblem, declared: InstrumentModel | None 
     base = Space(problem.nominal())
     mistakes = [*_mistakes(problem), *_other_wavelengths(problem, declared)]
 
-    def left(tried: InstrumentProblem) -> float:
-        return _left(tried, base, best_of_starts(tried, base, FEW_STARTS).values)
+    def chi2(tried: InstrumentProblem) -> float:
+        return _chi2(tried, base, best_of_starts(tried, base, FEW_STARTS).values)
 
-    return _best(mistakes, [left(w.problem.undivided()) for w in mistakes], left(problem.undivided()))
+    return _best(mistakes, [chi2(w.problem.undivided()) for w in mistakes], chi2(problem.undivided()))
 
 
-def _best(mistakes: Sequence[Wiring], lefts: Sequence[float], start: float) -> Wiring | None:
-    fits = [(chi2, k) for k, chi2 in enumerate(lefts) if chi2 < start / WIRING and start - chi2 > 2 * NEEDED]
+def _best(mistakes: Sequence[Wiring], values: Sequence[float], start: float) -> Wiring | None:
+    fits = [(chi2, k) for k, chi2 in enumerate(values) if chi2 < start / WIRING and start - chi2 > 2 * NEEDED]
     return mistakes[min(fits)[1]] if fits else None
 
 
-def _left(problem: InstrumentProblem, space: Space, values: Array) -> float:
+def _chi2(problem: InstrumentProblem, space: Space, values: Array) -> float:
     """Chi-square that is left; its own scatter is no reason to believe in a mistake."""
     sums = problem.sums(space, values, derivatives=False)
     excess, freedom = float(sums.excess.sum()), float(sums.freedom.sum())
@@ -136,10 +136,10 @@ def _other_wavelengths(problem: InstrumentProblem, declared: InstrumentModel | N
             yield Wiring(text, change, _changed(problem, lambda _, m=at: m))  # type: ignore[misc]
 
 
-def _scaled(problem: InstrumentProblem, axes: tuple[str, ...], factor: float, what: str) -> Wiring:
+def _scaled(problem: InstrumentProblem, axes: tuple[str, ...], factor: float, text: str) -> Wiring:
     elements = {e.name: {"ratio": e.ratio * factor} for e in problem.model.elements() if e.axis in axes}
     lines = ", ".join(f"{name!r}: ratio: {update['ratio']:g}" for name, update in elements.items())
-    return Wiring(what, f"in the instrument file, {lines}", _with_values(problem, elements))
+    return Wiring(text, f"in the instrument file, {lines}", _with_values(problem, elements))
 
 
 def _turned_mosaics(problem: InstrumentProblem) -> Iterator[Wiring]:

@@ -137,20 +137,20 @@ class ReducedSets:
 
     Attributes
     ----------
-    sets : of the groups `kept` (R,), numbers among all; `certain` (C,) are always there.
+    sets : of the groups `plausible` (R,), numbers among all; `certain` (C,) are always there.
     start : the likely state in them.
     """
 
-    def __init__(self, whole: Sets, state: State) -> None:
-        self._whole, self._state = whole, state
-        certain, odds = _worth(whole, state)
-        plausible = (whole.share == 1) | (odds > np.log(SHARES / (1 - SHARES)))
-        if (certain & whole.alone).any():
-            plausible &= ~whole.alone
-        self.certain, self.kept = np.flatnonzero(certain), np.flatnonzero(plausible & ~certain)
-        self._out, self._in = _positions(whole, self.certain), _positions(whole, self.kept)
-        unit, form = state.unit, whole.form
-        prior = [np.full(whole.groups[k].index.size, state.tau[k] ** -2.0) for k in self.certain]
+    def __init__(self, full: Sets, state: State) -> None:
+        self._whole, self._state = full, state
+        certain, odds = _worth(full, state)
+        plausible = (full.share == 1) | (odds > np.log(SHARES / (1 - SHARES)))
+        if (certain & full.alone).any():
+            plausible &= ~full.alone
+        self.certain, self.plausible = np.flatnonzero(certain), np.flatnonzero(plausible & ~certain)
+        self._out, self._in = _positions(full, self.certain), _positions(full, self.plausible)
+        unit, form = state.unit, full.form
+        prior = [np.full(full.groups[k].index.size, state.tau[k] ** -2.0) for k in self.certain]
         block = form.curvature[np.ix_(self._out, self._out)] / unit + np.diag(np.concatenate([np.zeros(0), *prior]))
         self._covariance = np.linalg.inv(block)
         cross = form.curvature[np.ix_(self._out, self._in)]
@@ -163,9 +163,9 @@ class ReducedSets:
             form.gradient[self._in] + cross.T @ self._mean,
             (curvature + curvature.T) / 2,
         )
-        certain_count = int(np.sum(whole.free[self.certain]))
-        self.sets = whole.among(reduced_form, self.kept, _renumbered(whole, self.kept), certain_count)
-        self.start = State(state.tau[self.kept].copy(), unit)
+        certain_count = int(np.sum(full.free[self.certain]))
+        self.sets = full.among(reduced_form, self.plausible, _renumbered(full, self.plausible), certain_count)
+        self.start = State(state.tau[self.plausible].copy(), unit)
 
     def lifted(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Mean (K,) and covariance (K, K) of all parameters, of those of the groups that are kept."""
@@ -181,7 +181,7 @@ class ReducedSets:
     def whole_state(self, state: State) -> State:
         """A state of all groups, of one of those that are kept."""
         tau = np.zeros(self._state.tau.size)
-        tau[self.certain], tau[self.kept] = self._state.tau[self.certain], state.tau
+        tau[self.certain], tau[self.plausible] = self._state.tau[self.certain], state.tau
         return State(tau, state.unit)
 
 
@@ -221,7 +221,7 @@ class _ByStay:
         self._seen: dict[bytes, float] = {}
         self.best: tuple[float, State] | None = None
 
-    def asked(self, state: State) -> tuple[Conditional, Array]:
+    def conditional(self, state: State) -> tuple[Conditional, Array]:
         """What a state says of every group given the others, and the probability (G,) of each."""
         key = state.tau.tobytes()
         if key not in self._known:
@@ -236,7 +236,7 @@ class _ByStay:
         sets, state = self._sets, start.copy()
         stays: dict[bytes, float] = {}
         for _ in range(changes):
-            c, chance = self.asked(state)
+            c, chance = self.conditional(state)
             rate = np.column_stack([1 - chance, chance[:, None] * c.tau_weights])
             at = np.argmin(np.abs(np.append(0.0, sets.taus)[:, None] - state.tau), axis=0)
             rate[np.arange(at.size), at] = 0.0
@@ -255,8 +255,8 @@ class _ByStay:
         total = sum(self._seen.values())
         return _moments(self._sets, ((weight / total, *self._known[key]) for key, weight in self._seen.items()))
 
-    def there(self) -> tuple[NDArray[np.bool_], Array]:
-        """Which groups (S, G) were there in each set, and how much it weighs (S,)."""
+    def inclusion(self) -> tuple[NDArray[np.bool_], Array]:
+        """Groups (S, G) of each set, and the weight (S,) of the set."""
         weight: dict[bytes, float] = {}
         for key, share in self._seen.items():
             inclusion = (np.frombuffer(key) > 0).tobytes()
@@ -273,11 +273,11 @@ def stay(sets: Sets, state: State, changes: int, seed: int = 0) -> Samples:
         average.visit(start, share, max(1, round(changes * share)), random)
     probability = chance_of(sets, sets.conditional(state))
     chance, mean, covariance = average.moments()
-    probability[reduced.kept] = chance
-    inside, weight = average.there()
+    probability[reduced.plausible] = chance
+    inside, weight = average.inclusion()
     inclusion = np.zeros((len(weight), len(sets.groups)), dtype=bool)
     inclusion[:, reduced.certain] = True
-    inclusion[:, reduced.kept] = inside
+    inclusion[:, reduced.plausible] = inside
     best = reduced.whole_state(average.best[1] if average.best else reduced.start)
     return Samples(probability, *reduced.lifted(mean, covariance), inclusion, weight, best)
 

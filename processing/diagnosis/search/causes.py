@@ -58,33 +58,33 @@ class Cause:
         return "sure" if self.probability >= SURE else "likely"
 
 
-def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
+def causes(posterior: Posterior, chi2: float) -> tuple[Cause, ...]:
     """Causes of the most likely set, the most certain first.
 
-    `left` is the chi-square of what no cause explains: less than that does not tell two of them apart.
+    `chi2` is that which no cause explains: a smaller difference does not separate two causes.
     """
-    state, (values, covariance) = found.samples.best, found.of_likeliest()
+    state, (values, covariance) = posterior.samples.best, posterior.of_likeliest()
     out = []
-    for k in found.there:
+    for k in posterior.free_groups:
         # Of every group to be there in the place of this one, its own among them.
-        odds = found.sets.conditional(found.sets.without(state, k)).log_odds
-        least = least_odds(odds[k], left / state.unit)
-        rivals = found.sets.free & (state.tau == 0) & (odds > least)
+        odds = posterior.sets.conditional(posterior.sets.without(state, k)).log_odds
+        least = least_odds(odds[k], chi2 / state.unit)
+        rivals = posterior.sets.free & (state.tau == 0) & (odds > least)
         alternatives = [int(j) for j in np.argsort(-odds) if rivals[j]]
-        alternatives += [j for j in found.others.get(k, ()) if j not in alternatives]
-        parts = [found.space.slices[m] for m in found.members[k]]
+        alternatives += [j for j in posterior.rivals.get(k, ()) if j not in alternatives]
+        parts = [posterior.space.slices[m] for m in posterior.members[k]]
         # From which state on it acts may be open where that it does is certain.
-        members = list(dict.fromkeys([k, *alternatives, *_of_family(found, k)]))
+        members = list(dict.fromkeys([k, *alternatives, *_of_family(posterior, k)]))
         # The sets that were visited, and the odds beside the likeliest, each err on the sure side.
         total = float(np.logaddexp.reduce(odds[members]))
         out.append(
             Cause(
-                candidates=tuple(found.space.candidates[m] for m in found.members[k]),
+                candidates=tuple(posterior.space.candidates[m] for m in posterior.members[k]),
                 values=tuple(values[p] for p in parts),
                 covariance=tuple(covariance[p, p] for p in parts),
-                probability=min(found.samples.any_of(members), float(probability_at(total))),
+                probability=min(posterior.samples.any_of(members), float(probability_at(total))),
                 log_odds=float(odds[k]),
-                alternatives=tuple(found.space.candidates[found.members[j][0]] for j in alternatives),
+                alternatives=tuple(posterior.space.candidates[posterior.members[j][0]] for j in alternatives),
             )
         )
     return tuple(sorted(out, key=lambda c: -c.log_odds))
@@ -96,22 +96,22 @@ def shown(values: Array, covariance: Array) -> float:
     return float(values @ np.linalg.lstsq(covariance, values)[0]) / max(SHOWN**2, n + SHOWN * float(np.sqrt(2 * n)))
 
 
-def least_odds(odds: float, left: float) -> float:
+def least_odds(odds: float, chi2: float) -> float:
     """Log odds from which on another group in a cause's place is named with it.
 
-    `left` is the chi-square that nothing explains, in its unit.
+    `chi2` is that which no cause explains, in its unit.
     """
-    return max(odds - max(float(np.log(SURE / (1 - SURE))), ALIKE * odds, 0.5 * left), 0.0)
+    return max(odds - max(float(np.log(SURE / (1 - SURE))), ALIKE * odds, 0.5 * chi2), 0.0)
 
 
-def _of_family(found: Posterior, k: int) -> list[int]:
+def _of_family(posterior: Posterior, k: int) -> list[int]:
     """The same effect from one state on, or another."""
-    return [j for j in range(len(found.members)) if found.label(j).family == found.label(k).family]
+    return [j for j in range(len(posterior.members)) if posterior.label(j).family == posterior.label(k).family]
 
 
-def information(found: Posterior) -> tuple[Array, NDArray[np.int64]]:
+def information(posterior: Posterior) -> tuple[Array, NDArray[np.int64]]:
     """Information (K,) about each value at its typical size, and which values are nominal ones, which are free."""
-    curvature, groups = found.sets.form.curvature, found.sets.groups
+    curvature, groups = posterior.sets.form.curvature, posterior.sets.groups
     precision = np.diag(curvature).copy()
     always = np.concatenate([np.zeros(0, dtype=np.int64), *(g.index for g in groups if g.fixed_tau is not None)])
     if always.size:
@@ -121,13 +121,13 @@ def information(found: Posterior) -> tuple[Array, NDArray[np.int64]]:
     return precision, always
 
 
-def would_be_seen(found: Posterior) -> tuple[Candidate, ...]:
+def would_be_seen(posterior: Posterior) -> tuple[Candidate, ...]:
     """Effects of optics, source or surface that at a typical size would stand out of the noise, or of what is left."""
-    precision, always = information(found)
-    precision /= found.samples.best.unit
+    precision, always = information(posterior)
+    precision /= posterior.samples.best.unit
     return tuple(
         candidate
-        for candidate, part in found.space.pairs
+        for candidate, part in posterior.space.pairs
         if not (candidate.state_chosen or candidate.acts_on_counts)
         and not (candidate.effect.varies_over_image or candidate.effect.is_switch or candidate.effect.per_state)
         and not np.isin(part.start, always)

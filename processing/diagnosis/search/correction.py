@@ -14,47 +14,47 @@ from processing.diagnosis.search.rules import LIKELY, SEEN, SHARES, TAKES_PART
 from processing.diagnosis.search.space import Problem, Space
 
 
-def applied(found: Posterior, base: Space, unfit: Collection[Candidate] = ()) -> tuple[Space, Array]:
+def applied(posterior: Posterior, base: Space, unfit: Collection[Candidate] = ()) -> tuple[Space, Array]:
     """Space and values of the correction: the mean of the posterior, of what is likely enough to take part."""
     keep = set(base.candidates)
-    by_label = {found.label(g): g for g in range(len(found.members))}
-    for cause in causes(found, 0.0):
+    by_label = {posterior.label(g): g for g in range(len(posterior.members))}
+    for cause in causes(posterior, 0.0):
         # That one of a class is there can be certain while none of it is likely by itself: each gets its share.
         if cause.probability >= LIKELY:
-            shares = [by_label[c] for c in cause.alternatives if found.samples.probability[by_label[c]] > SHARES]
-            keep |= {found.space.candidates[m] for g in shares for m in found.members[g]} | set(cause.candidates)
-    for g in _least_needed(found, keep):
-        keep |= {found.space.candidates[m] for m in found.members[g]}
+            shares = [by_label[c] for c in cause.alternatives if posterior.samples.probability[by_label[c]] > SHARES]
+            keep.update(cause.candidates, (posterior.space.candidates[m] for g in shares for m in posterior.members[g]))
+    for g in _least_needed(posterior, keep):
+        keep |= {posterior.space.candidates[m] for m in posterior.members[g]}
     keep -= set(unfit)
-    order = [*base.candidates, *(c for c in found.space.candidates if c in keep and c not in base.candidates)]
+    order = [*base.candidates, *(c for c in posterior.space.candidates if c in keep and c not in base.candidates)]
     space = Space(tuple(order))
-    return space, space.vector(found.space.split(found.values))
+    return space, space.vector(posterior.space.split(posterior.values))
 
 
-def _least_needed(found: Posterior, keep: Collection[Candidate]) -> list[int]:
+def _least_needed(posterior: Posterior, keep: Collection[Candidate]) -> list[int]:
     """Groups beside those to `keep` that are likely enough to take part, and as many more as the fit would miss.
 
     Several that are unlikely one by one can be one cause together: the mean has a part of each, which are nothing
     without each other.
     """
-    space, form = found.space, found.sets.form
-    order = np.argsort(-found.samples.probability)
+    space, form = posterior.space, posterior.sets.form
+    order = np.argsort(-posterior.samples.probability)
     is_used = np.concatenate([np.zeros(0, dtype=bool), *(np.full(c.size, c in keep) for c in space.candidates)])
-    mean = found.values / space.joined("typical")
+    mean = posterior.values / space.joined("typical")
     chi2_at_mean = form.at(mean)
     out: list[int] = []
     for g in order:
         loss = form.at(np.where(is_used, mean, 0.0)) - chi2_at_mean
-        if found.samples.probability[g] <= TAKES_PART and loss <= SEEN * found.samples.best.unit:
+        if posterior.samples.probability[g] <= TAKES_PART and loss <= SEEN * posterior.samples.best.unit:
             break
         out.append(int(g))
-        for m in found.members[g]:
+        for m in posterior.members[g]:
             is_used[space.slices[m]] = True
     return out
 
 
 def solution(
-    problem: Problem, found: Posterior, base: Space, start: Array, *, unfit: Collection[Candidate] = ()
+    problem: Problem, posterior: Posterior, base: Space, start: Array, *, unfit: Collection[Candidate] = ()
 ) -> Solution:
     """The correction of a posterior, without what is `unfit`, and how well it predicts what it did not see.
 
@@ -62,11 +62,11 @@ def solution(
     """
     base_fit = minimize(problem, base, start)
     before = held_out(problem, base, base_fit)
-    space, values = applied(found, base, unfit)
+    space, values = applied(posterior, base, unfit)
     problem.relinearize(space, values)
     sums = problem.sums(space, values)
     fit = Fit(values, sums, float(sums.excess.sum()))
     typical = space.joined("typical")
-    spread = space.vector(found.space.split(np.diag(found.covariance)))
-    weak = found.samples.best.unit / np.maximum(np.sqrt(spread + values**2), LEAST_WIDTH * typical) ** 2
+    spread = space.vector(posterior.space.split(np.diag(posterior.covariance)))
+    weak = posterior.samples.best.unit / np.maximum(np.sqrt(spread + values**2), LEAST_WIDTH * typical) ** 2
     return Solution(base, base_fit, before, space, fit, held_out(problem, space, fit, weak), weak)

@@ -82,14 +82,14 @@ class PredictedChange:
         return round(self.chance_worse, 4)
 
 
-def predicted_change(given: Array, mean: Array, covariance: Array, products: Array) -> PredictedChange:
-    """Of values `given` (K,), where the true ones have a mean (K,) and a covariance (K, K).
+def predicted_change(correction: Array, mean: Array, covariance: Array, products: Array) -> PredictedChange:
+    """Of a `correction` (K,), where the true ones have a mean (K,) and a covariance (K, K).
 
     `products` (K, K) of the slopes of what the user reads, averaged.
     """
     variance = max(float(np.sum(products * covariance)), 0.0)
-    along, missed = products @ given, mean - given
-    size = float(np.sqrt(max(float(given @ along), 0.0)))
+    along, missed = products @ correction, mean - correction
+    size = float(np.sqrt(max(float(correction @ along), 0.0)))
     stderr = float(np.sqrt(max(float(along @ covariance @ along), 0.0))) / max(size, 1e-300)
     before, after = (np.sqrt(variance + max(float(v @ products @ v), 0.0)) for v in (mean, missed))
     return PredictedChange(float(before), float(after), size, float(mean @ along) / max(size, 1e-300), stderr)
@@ -109,9 +109,9 @@ def chance_checks(quantity: str, change: PredictedChange) -> tuple[Check, Check]
     )
 
 
-def refusal(found: tuple[Check, ...]) -> str | None:
+def refusal(figures: tuple[Check, ...]) -> str | None:
     """Why a correction is not written, in words; None if every figure holds."""
-    worse = [c.told for c in found if not c.holds]
+    worse = [c.told for c in figures if not c.holds]
     return "; ".join(worse) if worse else None
 
 
@@ -123,7 +123,7 @@ class Judgement:
     ----------
     named, sure : whether a cause is there, and whether nothing speaks against the name of one.
     structure : whether tests see something in what is left.
-    seen : whether a fault of typical size would have been seen.
+    observable : whether a fault of typical size would have been seen.
     figures : of the residual and of W, before and after; chances : that what the user reads gets worse.
     first : what has to be changed before anything else means something.
     """
@@ -131,7 +131,7 @@ class Judgement:
     named: bool
     sure: bool
     structure: bool
-    seen: bool
+    observable: bool
     figures: tuple[Check, ...] = ()
     chances: tuple[Check, ...] = ()
     first: str | None = None
@@ -145,7 +145,7 @@ class Judgement:
             return "partly_explained" if self.sure else "unexplained"
         if self.named:
             return "explained" if self.sure else "partly_explained"
-        return "consistent" if self.seen else "undetermined"
+        return "consistent" if self.observable else "undetermined"
 
     @property
     def checks(self) -> tuple[Check, ...]:
@@ -157,7 +157,7 @@ class Judgement:
         """Why the correction is not written, in words; None if every figure holds."""
         return refusal(self.checks) if self.first is None else f"change this first: {self.first}"
 
-    def kept(self, solved: Solution, any_cause: bool) -> Solution:
+    def applied(self, solved: Solution, any_cause: bool) -> Solution:
         """What is applied: a solution that holds, if there is anything in it; else nothing."""
         holds = self.refused is None and (any_cause or any(c.place for c in solved.base.candidates))
         return solved if holds else solved.undone
@@ -175,7 +175,7 @@ def in_words(tests: Mapping[str, float]) -> list[str]:
     return [f"{name}: {value:.0f} standard deviations above noise" for name, value in beyond_chance(tests).items()]
 
 
-def in_deviations(found: dict[str, tuple[float, float]]) -> tuple[dict[str, float], float]:
+def in_deviations(tests: dict[str, tuple[float, float]]) -> tuple[dict[str, float], float]:
     """Tests in standard deviations, of their chi-square beyond noise and its deviation, and the most beyond two."""
-    excess = max(chi2 - 2 * deviation for chi2, deviation in found.values())
-    return {k: float(chi2 / deviation) for k, (chi2, deviation) in found.items()}, max(float(excess), 0.0)
+    excess = max(chi2 - 2 * deviation for chi2, deviation in tests.values())
+    return {k: float(chi2 / deviation) for k, (chi2, deviation) in tests.items()}, max(float(excess), 0.0)

@@ -38,7 +38,7 @@ def all_at_once(
     values = x[positions]
     for _ in range(EXPANSIONS):
         sums = problem.sums(part, values, derivatives=False)
-        weak = noise.unit(sums.left(problem.noise_known)) / width**2
+        weak = noise.unit(sums.chi2(problem.noise_known)) / width**2
         new = minimize(problem, part, values, steps=3, expansions=0, weak=weak).values
         moved, values = np.max(np.abs(new - values) / width), new
         if not problem.relinearize(part, values) and moved < SETTLED:

@@ -17,15 +17,15 @@ STEPS = 60
 AT_ONCE = 6
 
 
-def likely_set(sets: Sets, kept: BoolArray | None = None) -> State:
+def likely_set(sets: Sets, initial: BoolArray | None = None) -> State:
     """The likeliest of some: several causes together can be plain where each alone is nothing, and the reverse.
 
-    Also from the groups `kept` (G,) on, in the unit of noise: in that of structure a prior is too stiff for what would
-    explain it.
+    One search starts from the groups `initial` (G,), in the unit of noise: in that of structure a prior is too stiff
+    for a cause that explains it.
     """
     states = [climb(sets, sets.empty()), climb(sets, thinned(sets))]
-    if kept is not None:
-        begin = State(np.where(kept & sets.free, 1.0, sets.empty().tau), sets.noise.floor)
+    if initial is not None:
+        begin = State(np.where(initial & sets.free, 1.0, sets.empty().tau), sets.noise.floor)
         retune(sets, begin)
         states.append(climb(sets, begin))
     return max(states, key=lambda s: sets.fitted(s).score)

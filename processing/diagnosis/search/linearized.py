@@ -59,9 +59,9 @@ def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic
     h = sums.curvature.sum(axis=0) * np.outer(typical, typical)
     h = h - np.outer(g, a) - np.outer(a, g) + (excess - freedom) * np.outer(a, a)
     g = g - excess * a
-    factors = _told(problem, space, x, h, typical=typical)
+    factors = _signal_share(problem, space, x, h, typical=typical)
     h, g = h * np.outer(factors, factors), g * factors
-    excess, g, h = _whatever(np.sqrt(problem.time_noise(space, x)) / typical, excess, g, h)
+    excess, g, h = _integrate_out(np.sqrt(problem.time_noise(space, x)) / typical, excess, g, h)
     value, vector = np.linalg.eigh(h)
     h = (vector * np.maximum(value, 0.0)) @ vector.T
     z = x / typical
@@ -69,15 +69,15 @@ def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic
     return Quadratic(float(total - 2 * g @ z + z @ h @ z), g - h @ z, h)
 
 
-def _whatever(sigma: Array, excess: float, g: Array, h: Array) -> tuple[float, Array, Array]:
-    """A form whatever is added to its values (K,), each normal with `sigma` (K,), integrated out."""
+def _integrate_out(sigma: Array, excess: float, g: Array, h: Array) -> tuple[float, Array, Array]:
+    """A form with normal shifts of its values (K,), of standard deviation `sigma` (K,), integrated out."""
     index = np.flatnonzero(sigma)
     s, across = sigma[index], h[:, index]
     cov = np.linalg.inv(np.eye(index.size) + across[index] * np.outer(s, s)) * np.outer(s, s)
     return float(excess - g[index] @ cov @ g[index]), g - across @ cov @ g[index], h - across @ cov @ across.T
 
 
-def _told(problem: Problem, space: Space, x: Array, h: Array, *, typical: Array) -> Array:
+def _signal_share(problem: Problem, space: Space, x: Array, h: Array, *, typical: Array) -> Array:
     """Share (K,) of the curvature that is not noise of image derivatives."""
     noise = np.diag(problem.noise_information(space, x)) * typical**2
     return np.asarray(np.clip(1 - noise / np.maximum(np.diag(h), 1e-300), 0.0, 1.0))

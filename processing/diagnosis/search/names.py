@@ -41,26 +41,26 @@ class Names:
 
 
 def with_parts(
-    found: Posterior, causes: Sequence[Cause], doubt: Mapping[Cause, str], *, left: float, noise_known: bool
+    posterior: Posterior, causes: Sequence[Cause], doubt: Mapping[Cause, str], *, chi2: float, noise_known: bool
 ) -> dict[Cause, str]:
     """Reasons of doubt by cause, with those of being a part of something else.
 
-    `left` is the chi-square of structure.
+    `chi2` is that of structure.
     """
     out = dict(doubt)
     for rank, cause in enumerate(causes, 1):
         if noise_known:
-            weak = 2 * cause.log_odds * found.samples.best.unit < TIMES * rank**2 * left
+            weak = 2 * cause.log_odds * posterior.samples.best.unit < TIMES * rank**2 * chi2
         else:
             general = cause.candidates[0].effect.per_state or cause.candidates[0].is_pointwise
-            directions = found.sets.noise.directions if general else 0.0
+            directions = posterior.sets.noise.directions if general else 0.0
             weak = cause.log_odds < max(CERTAIN, TIMES * directions / 2)
         # What the simple form of another cause leaves over is no cause of its own.
         weak |= any(cause.log_odds < o.candidates[0].effect.rough * o.log_odds for o in causes)
         if cause not in out and weak:
             out[cause] = PART_OF_LEFT
     # A sentence is a part of an unknown mechanism, whose other parts look like effects of the list.
-    if any(found.label(k).price for k in found.there):
+    if any(posterior.label(k).price for k in posterior.free_groups):
         out |= {cause: PART_OF_UNLISTED for cause in causes if cause not in out and cause.answer != "unlisted"}
     return out
 
@@ -74,7 +74,7 @@ def at_bound(cause: Cause) -> bool:
     return False
 
 
-def told_answer(cause: Cause, doubt: str | None) -> tuple[Answer, float]:
+def answer_of(cause: Cause, doubt: str | None) -> tuple[Answer, float]:
     """The word for a cause and its probability: what may be a part of something else is not sure, what is doubted for
     another reason is not told."""
     if doubt is None:

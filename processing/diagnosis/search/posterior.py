@@ -1,7 +1,7 @@
 """The posterior of all effects at once: linearize, find which groups are there, improve the solution, again.
 
 Every effect at every place takes part from the beginning, so no order of adding matters. Values of one kind in several
-captures are one group; a slip is one of as many alternatives as there are states.
+captures are one group; a slip is one of as many rivals as there are states.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Posterior:
     ----------
     space : all candidates; members : numbers of the candidates of each group.
     sets, samples : the last linearization, and the sets that were visited in it.
-    others : by a group that is there, those that do as well in its place where each is linearized about its own values.
+    rivals : by a group that is there, those that do as well in its place where each is linearized about its own values.
     values : (K,) mean; covariance : (K, K), both in the units of the parameters.
     """
 
@@ -62,7 +62,7 @@ class Posterior:
     samples: Samples
     values: Array
     covariance: Array
-    others: Mapping[int, tuple[int, ...]]
+    rivals: Mapping[int, tuple[int, ...]]
 
     @property
     def score(self) -> float:
@@ -75,7 +75,7 @@ class Posterior:
         return self.samples.any_of(np.flatnonzero(self.sets.free).tolist()) >= SURE
 
     @property
-    def there(self) -> list[int]:
+    def free_groups(self) -> list[int]:
         """Groups of the likeliest set that might be absent."""
         return [int(k) for k in np.flatnonzero((self.samples.best.tau > 0) & self.sets.free)]
 
@@ -91,7 +91,7 @@ class Posterior:
         return self.space.candidates[self.members[group][0]]
 
 
-def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start: Array, *, say: Say) -> Posterior:
+def fit_posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start: Array, *, say: Say) -> Posterior:
     """The posterior of all values of a space.
 
     Parameters
@@ -100,12 +100,12 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     start : (K,) values to begin with.
     """
     members, groups = grouped(space, fixed)
-    about, sets, state, alternatives = _found(problem, space, fixed, members, groups=groups, start=start)
+    about, sets, state, rivals = _expand(problem, space, fixed, members, groups=groups, start=start)
     # Where what is left is the noise, each set has a unit of its own, and counts by its evidence.
     samples = stay(sets, state, CHANGES) if sets.noise.known else sample(sets, state, SAMPLES)
     labels = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(labels) or 'nothing'}; unit of chi-square {state.unit:.3g}")
-    return _posterior_of(problem, space, members, sets, samples=samples, about=about, others=alternatives)
+    return _posterior_of(problem, space, members, sets, samples=samples, about=about, rivals=rivals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +130,7 @@ class _Round:
 Look = Callable[[Array, BoolArray | None], _Round | None]
 
 
-def _found(
+def _expand(
     problem: Problem,
     space: Space,
     fixed: Sequence[Candidate],
@@ -141,14 +141,14 @@ def _found(
 ) -> tuple[Array, Sets, State, dict[int, tuple[int, ...]]]:
     """Values (K,) about which it was linearized, the sets there, the likeliest of them, and what does as well."""
 
-    def look(x: Array, kept: BoolArray | None = None) -> _Round | None:
+    def look(x: Array, initial: BoolArray | None = None) -> _Round | None:
         problem.relinearize(space, x)
         sums = problem.sums(space, x)
         form = quadratic(problem, space, x, sums)
         if not (np.isfinite(form.excess) and np.all(np.isfinite(form.curvature))):
             return None
         sets = Sets(form, groups, noise_of(problem, sums))
-        return _Round(x, form.at(x / space.joined("typical")), sets, likely_set(sets, kept), kept is not None)
+        return _Round(x, form.at(x / space.joined("typical")), sets, likely_set(sets, initial), initial is not None)
 
     first = look(start)
     assert first is not None, "the instrument as declared has no intensities"
@@ -160,43 +160,43 @@ def _found(
         by_itself = [look(alone(problem, space, members[g]), np.arange(len(groups)) == g) for g in bent]
         begun += [trial for trial in by_itself if trial is not None and trial.score > first.score]
     rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
-    ended = [_settled(problem, space, trial, look, rounds=rounds) for trial in begun if trial is not None]
+    ended = [_settle(problem, space, trial, look, rounds=rounds) for trial in begun if trial is not None]
     last = max(ended, key=lambda trial: trial.score)
     problem.relinearize(space, last.about)
     down = problem.noise_known and last.state.unit <= BENT
     bends = [g for g, indices in enumerate(members) if space.candidates[indices[0]].is_pointwise]
     # Structure is described by whatever comes nearest to it: what is found beside it is not compared so closely.
-    last, alternatives = _of_bends(problem, space, last, bends if down else (), look=look)
-    return last.about, last.sets, last.state, alternatives
+    last, rivals = _of_bends(problem, space, last, bends if down else (), look=look)
+    return last.about, last.sets, last.state, rivals
 
 
 def _of_bends(
-    problem: Problem, space: Space, found: _Round, bends: Sequence[int], *, look: Look
+    problem: Problem, space: Space, first: _Round, bends: Sequence[int], *, look: Look
 ) -> tuple[_Round, dict[int, tuple[int, ...]]]:
     """The likeliest, of this and of those with another of the `bends` (groups) in the place of one that is there.
 
     Corrections of counts are expanded about what was found, where the right one may look worse than a wrong one. Also
     which others do as well as each that is there, about their own values.
     """
-    rounds = [found]
-    for k in (g for g in bends if found.state.tau[g] > 0):
-        for j in (g for g in bends if found.state.tau[g] == 0):
-            state = found.sets.without(found.state, k)
-            state.tau[j] = found.state.tau[k]
-            trial = look(minimum_of(problem, space, found.sets, found.sets.settled(state)), None)
+    rounds = [first]
+    for k in (g for g in bends if first.state.tau[g] > 0):
+        for j in (g for g in bends if first.state.tau[g] == 0):
+            state = first.sets.without(first.state, k)
+            state.tau[j] = first.state.tau[k]
+            trial = look(minimum_of(problem, space, first.sets, first.sets.settled(state)), None)
             rounds += [trial] if trial is not None else []
     best = max(rounds, key=lambda trial: trial.score)
     problem.relinearize(space, best.about)
 
-    def there(one: _Round) -> set[int]:
-        return {g for g in bends if one.state.tau[g] > 0}
+    def groups_in(trial: _Round) -> set[int]:
+        return {g for g in bends if trial.state.tau[g] > 0}
 
     # The noise is that of the light which the first of them tells: it is preferred by more than its evidence.
-    best_groups, likely = there(best), [there(trial) for trial in rounds if trial.score > best.score - CERTAIN]
+    best_groups, likely = groups_in(best), [groups_in(trial) for trial in rounds if trial.score > best.score - CERTAIN]
     return best, {k: tuple(sorted({j for on in likely if k not in on for j in on - best_groups})) for k in best_groups}
 
 
-def _settled(problem: Problem, space: Space, first: _Round, look: Look, *, rounds: int) -> _Round:
+def _settle(problem: Problem, space: Space, first: _Round, look: Look, *, rounds: int) -> _Round:
     """Linearized anew about what was found, at most so many times, until it stays.
 
     Values that the data hardly tell can move on and on beside each other, to where the problem is another one. So it
@@ -228,12 +228,12 @@ def _posterior_of(
     *,
     samples: Samples,
     about: Array,
-    others: Mapping[int, tuple[int, ...]],
+    rivals: Mapping[int, tuple[int, ...]],
 ) -> Posterior:
     """The posterior of a problem linearized `about` values (K,)."""
     typical, values = space.joined("typical"), mean_over_sets(space, samples, np.ones(space.size))
     sums = problem.sums(space, values, derivatives=False)
-    if not sets.noise.unit(sums.left(problem.noise_known)) <= GROWTH * sets.noise.unit(sets.form.at(values / typical)):
+    if not sets.noise.unit(sums.chi2(problem.noise_known)) <= GROWTH * sets.noise.unit(sets.form.at(values / typical)):
         # The least certain values lie along a bent valley, in which the straight line to their mean does not stay.
         values = improved(problem, space, sets.groups, samples, starts=[about], steps=2 * STEPS)
-    return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical), others)
+    return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical), rivals)

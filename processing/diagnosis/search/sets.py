@@ -89,27 +89,28 @@ class Noise:
     slack: float = 0.0
     floor: float = 1.0
 
-    def units(self, left: Array) -> Array:
-        """Most likely unit where the excess `left` is left, what the prior takes included."""
-        beyond = self.directions + np.maximum(left - self.slack, 0.0) if self.known else left
+    def units(self, excess: Array) -> Array:
+        """Most likely unit where a fit has an `excess`, the cost of the prior included."""
+        beyond = self.directions + np.maximum(excess - self.slack, 0.0) if self.known else excess
         return np.maximum(beyond / self.directions, self.floor)
 
-    def unit(self, left: float) -> float:
+    def unit(self, excess: float) -> float:
         """The same of one excess."""
-        return float(self.units(np.array(left)))
+        return float(self.units(np.array(excess)))
 
-    def log_likelihoods(self, left: Array) -> Array:
+    def log_likelihoods(self, excess: Array) -> Array:
         """Log of the likelihood with the most likely unit."""
-        spread, within = left, np.zeros(())
+        spread, within = excess, np.zeros(())
         if self.known:
             # Within the noise differences count in full.
-            spread, within = self.directions + np.maximum(left - self.slack, 0.0), np.minimum(left - self.slack, 0.0)
-        unit = self.units(left)
+            spread = self.directions + np.maximum(excess - self.slack, 0.0)
+            within = np.minimum(excess - self.slack, 0.0)
+        unit = self.units(excess)
         return np.asarray(-0.5 * (self.directions * np.log(unit) + spread / unit + within))
 
-    def log_likelihood(self, left: float) -> float:
+    def log_likelihood(self, excess: float) -> float:
         """The same of one excess."""
-        return float(self.log_likelihoods(np.array(left)))
+        return float(self.log_likelihoods(np.array(excess)))
 
 
 @dataclass
@@ -128,13 +129,13 @@ class State:
 class Fitted:
     """Posterior of the parameters of one set: which `active` (A,), mean (A,), covariance (A, A), and how likely.
 
-    `left` is the excess that is left (what the prior takes included), `score` the log probability of the set.
+    `excess` is that of the fit (the cost of the prior included), `score` the log probability of the set.
     """
 
     active: NDArray[np.int64]
     mean: Array
     covariance: Array
-    left: float
+    excess: float
     score: float
 
 
@@ -178,7 +179,7 @@ class Sets:
     def settled(self, state: State) -> State:
         """The state with the unit that goes with what it leaves."""
         for _ in range(4):
-            before, state.unit = state.unit, self.noise.unit(self._left(state))
+            before, state.unit = state.unit, self.noise.unit(self._excess(state))
             if state.unit == before:
                 break
         return state
@@ -189,8 +190,8 @@ class Sets:
         out.tau[k] = 0.0
         return out
 
-    def among(self, form: Quadratic, kept: NDArray[np.int64], groups: Sequence[Group], beside: int) -> Sets:
-        """The same prior for the groups `kept` alone, with new positions, where `beside` of the others are there."""
+    def among(self, form: Quadratic, indices: NDArray[np.int64], groups: Sequence[Group], beside: int) -> Sets:
+        """The same prior for the groups `indices` alone, with new positions; `beside` of the others are in the set."""
         return Sets(form, groups, self.noise, self.count, beside=self.beside + beside)
 
     def _log_prior(self, tau: Array) -> float:
@@ -199,25 +200,25 @@ class Sets:
         weight = self.tau_weight[is_included, np.argmin(np.abs(self.taus[:, None] - tau[is_included]), axis=0)]
         return self.log_prior(is_included) + float(np.log(np.maximum(weight, LEAST_WEIGHT)).sum())
 
-    def log_prior(self, there: NDArray[np.bool_]) -> float:
+    def log_prior(self, is_included: NDArray[np.bool_]) -> float:
         """Log probability of a set: how likely a group is is learnt from how many there are (beta-binomial)."""
-        k, n = float(there.sum()) + self.beside, self.count
+        k, n = float(is_included.sum()) + self.beside, self.count
         count = betaln(1 + k, max(n - k, 0.0) + FEW_CAUSES * n) - betaln(1, (1 + FEW_CAUSES) * n)
-        too_many = max(float((there & self.alone).sum()) - 1, 0.0)
-        return float(count - np.log(self.share[there]).sum() - self.price[there].sum()) + NEVER * too_many
+        too_many = max(float((is_included & self.alone).sum()) - 1, 0.0)
+        return float(count - np.log(self.share[is_included]).sum() - self.price[is_included].sum()) + NEVER * too_many
 
-    def prior_odds(self, there: NDArray[np.bool_]) -> Array:
+    def prior_odds(self, is_included: NDArray[np.bool_]) -> Array:
         """Log odds (G,) of each group to be there, of the prior, given the others of a set."""
-        other_count = self.beside + there.sum() - there
+        other_count = self.beside + is_included.sum() - is_included
         absent_count = np.maximum((1 + FEW_CAUSES) * self.count - other_count - 1, FEWEST_ABSENT)
-        beside = np.where(self.alone, (there & self.alone).sum() - (there & self.alone), 0.0)
+        beside = np.where(self.alone, (is_included & self.alone).sum() - (is_included & self.alone), 0.0)
         return np.asarray(np.log((1 + other_count) / absent_count / self.share) - self.price) + NEVER * beside
 
     def fitted(self, state: State) -> Fitted:
         """Posterior of the parameters that are there."""
         return self._solved(state)[0]
 
-    def _left(self, state: State) -> float:
+    def _excess(self, state: State) -> float:
         """Excess that a set leaves, what the prior takes included."""
         active, _, lower = self._factored(state)
         right = solve_triangular(lower, self.form.gradient[active], lower=True) if active.size else np.zeros(0)
@@ -248,7 +249,7 @@ class Sets:
         """
         fit, inverse, right = self._solved(state)
         log_odds = np.full(len(self.groups), np.inf)
-        weights, now = np.zeros((len(self.groups), self.taus.size)), self.noise.log_likelihood(fit.left)
+        weights, now = np.zeros((len(self.groups), self.taus.size)), self.noise.log_likelihood(fit.excess)
         for members, s, q in self._cavities(state, fit, inverse, right):
             # Most groups are one value, which is its own axis: LAPACK would take as long for each as for a matrix.
             alone = s.shape[1] == 1
@@ -259,7 +260,7 @@ class Sets:
             explained = np.sum(t2 * along / (1 + t2 * value), axis=2)
             gain = 0.5 * (explained - np.sum(np.log1p(t2 * value), axis=2))
             if follow and (new := state.tau[members] == 0).any():
-                excess = fit.left - state.unit * explained[new]
+                excess = fit.excess - state.unit * explained[new]
                 wider = np.log1p(t2 * value[new] * (state.unit / self.noise.units(excess))[..., None])
                 gain[new] = self.noise.log_likelihoods(excess) - now - 0.5 * np.sum(wider, axis=2)
             gain += np.log(np.maximum(self.tau_weight[members], LEAST_WEIGHT))

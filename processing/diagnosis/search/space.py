@@ -44,7 +44,7 @@ class Sums:
         gradient, stretch = np.zeros((2, f, k))
         return cls(a, b, c, d, gradient, np.zeros((f, k, k)), stretch, np.zeros((captures, 4, f)))
 
-    def left(self, noise_known: bool) -> float:
+    def chi2(self, noise_known: bool) -> float:
         """Chi-square beyond noise; all of it where the noise is not known."""
         return float(self.excess.sum()) + (0.0 if noise_known else float(self.freedom.sum()))
 

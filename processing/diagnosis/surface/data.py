@@ -71,10 +71,10 @@ class SurfaceData:
     omega_deg: float
     clipped_fraction: float
 
-    def kept(self, pixels: NDArray[np.bool_]) -> SurfaceData:
+    def select(self, pixels: NDArray[np.bool_]) -> SurfaceData:
         """The same with some of the pixels alone."""
         same = {name: getattr(self, name)[pixels] for name in ("y", "variance", "fold", "tile", "where")}
-        return replace(self, view=self.view.kept(pixels), **same)
+        return replace(self, view=self.view.select(pixels), **same)
 
     def polarized(self, flat: Array) -> NDArray[np.bool_]:
         """Pixels (P,) of the tiles whose light is modulated by more than the noise of a pixel.

@@ -15,7 +15,7 @@ from processing.diagnosis.search.correction import solution
 from processing.diagnosis.search.decision import Judgement, beyond_chance, in_words
 from processing.diagnosis.search.fit import Fit, Solution
 from processing.diagnosis.search.names import AT_BOUND, Names, at_bound, with_parts
-from processing.diagnosis.search.posterior import Posterior, Say, posterior
+from processing.diagnosis.search.posterior import Posterior, Say, fit_posterior
 from processing.diagnosis.search.range_of import least_apart, rank_of
 from processing.diagnosis.search.result import CaptureReport, Correction, Diagnosis
 from processing.diagnosis.search.rules import APART, LIKELY, LIMIT, SHOWN
@@ -58,40 +58,40 @@ class SurfaceJudged:
     """The diagnosis, and before and after for the report."""
 
     diagnosis: SurfaceDiagnosis
-    found: Solution
+    solution: Solution
 
 
 def diagnose_surface(problem: SurfaceProblem, material: str, say: Say) -> SurfaceJudged:
     """Find the posterior, test what is left, guard the correction, and name causes."""
     space = Space(problem.pool())
-    found = posterior(problem, space, (), np.zeros(space.size), say=say)
+    posterior = fit_posterior(problem, space, (), np.zeros(space.size), say=say)
     say("testing what is left over")
-    solved, captures = solution(problem, found, Space(()), np.zeros(0)), range(len(problem.captures))
-    found, covariance, wider = as_wide_as_the_valley(problem, found, solved)
+    solved, captures = solution(problem, posterior, Space(()), np.zeros(0)), range(len(problem.captures))
+    posterior, covariance, wider = as_wide_as_the_valley(problem, posterior, solved)
     (before, _), (after, excess) = (
         zip(*(structure(problem, k, at, fit.values) for k in captures), strict=True) for at, fit in solved.ends
     )
     has_structure = any(map(beyond_chance, after))
-    names = names_of(found, wider, sum(excess) if has_structure else 0.0)
+    names = names_of(posterior, wider, sum(excess) if has_structure else 0.0)
     judgement = Judgement(
         named=bool(names.named),
         sure=bool(names.named),
         structure=has_structure,
-        seen=bool(would_be_seen(found)),
+        observable=bool(would_be_seen(posterior)),
         figures=checks(problem, solved),
         chances=chances(problem, solved, covariance),
     )
-    answer = Answer(problem, found, solved, names, judgement)
-    return SurfaceJudged(_told(answer, problem, material, before=before, after=after), answer.kept)
+    answer = Answer(problem, posterior, solved, names, judgement)
+    return SurfaceJudged(_report(answer, problem, material, before=before, after=after), answer.applied)
 
 
-def names_of(found: Posterior, wider: Array, left: float) -> Names:
-    """Likely causes without those that may be something else; `left` is the chi-square of structure.
+def names_of(posterior: Posterior, wider: Array, chi2: float) -> Names:
+    """Likely causes without those that may be something else; `chi2` is that of structure.
 
     Their errors are `wider` (K,) than slopes promise.
     """
-    likely, part = [c for c in causes(found, left) if c.probability >= LIKELY], dict(found.space.pairs)
-    doubt = with_parts(found, likely, {c: AT_BOUND for c in likely if at_bound(c)}, left=left, noise_known=True)
+    likely, part = [c for c in causes(posterior, chi2) if c.probability >= LIKELY], dict(posterior.space.pairs)
+    doubt = with_parts(posterior, likely, {c: AT_BOUND for c in likely if at_bound(c)}, chi2=chi2, noise_known=True)
     named = []
     for cause in (c for c in likely if c not in doubt):
         factors = [np.outer(wider[part[c]], wider[part[c]]) for c in cause.candidates]
@@ -101,7 +101,7 @@ def names_of(found: Posterior, wider: Array, left: float) -> Names:
 
 
 def as_wide_as_the_valley(
-    problem: SurfaceProblem, found: Posterior, solved: Solution
+    problem: SurfaceProblem, posterior: Posterior, solved: Solution
 ) -> tuple[Posterior, Array, Array]:
     """The posterior and the covariance of the values that are corrected, as wide as the chi-square is.
 
@@ -110,25 +110,25 @@ def as_wide_as_the_valley(
     Slopes at one point promise less than a bent valley holds. Along each principal axis an error is a third of the way
     to where chi-square and prior, the mean of both sides, have risen by nine.
     """
-    space, values, part = solved.space, solved.fit.values, dict(found.space.pairs)
+    space, values, part = solved.space, solved.fit.values, dict(posterior.space.pairs)
     index = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[part[c]] for c in space.candidates)])
     typical, lower, upper = (space.joined(name) for name in ("typical", "lower", "upper"))
-    size, axes = np.linalg.eigh(found.covariance[np.ix_(index, index)] / np.outer(typical, typical))
+    size, axes = np.linalg.eigh(posterior.covariance[np.ix_(index, index)] / np.outer(typical, typical))
     wide = np.ones(size.size)
     for j in np.flatnonzero(size > 0):
         step = SHOWN * np.sqrt(size[j]) * axes[:, j] * typical
         ends = [np.clip(values + sign * step, lower, upper) for sign in (1, -1)]
         rise = np.mean([problem.sums(space, end, derivatives=False).excess.sum() for end in ends]) - solved.fit.excess
         # What the data do not tell is as wide as its prior.
-        rise = max(rise + solved.weak @ step**2, 1e-300) / found.samples.best.unit
+        rise = max(rise + solved.weak @ step**2, 1e-300) / posterior.samples.best.unit
         wide[j] = np.clip(SHOWN / np.sqrt(rise), 1.0, MOST_WIDER)
-    covariance = found.covariance.copy()
+    covariance = posterior.covariance.copy()
     covariance[np.ix_(index, index)] = (axes * size * wide**2) @ axes.T * np.outer(typical, typical)
-    wider = np.sqrt(np.diag(covariance) / np.maximum(np.diag(found.covariance), 1e-300))
-    return replace(found, covariance=covariance), covariance[np.ix_(index, index)], wider
+    wider = np.sqrt(np.diag(covariance) / np.maximum(np.diag(posterior.covariance), 1e-300))
+    return replace(posterior, covariance=covariance), covariance[np.ix_(index, index)], wider
 
 
-def _told(
+def _report(
     answer: Answer,
     problem: SurfaceProblem,
     material: str,
@@ -136,14 +136,14 @@ def _told(
     before: Sequence[dict[str, float]],
     after: Sequence[dict[str, float]],
 ) -> SurfaceDiagnosis:
-    final, names, verdict = answer.kept, answer.names, answer.judgement.verdict
+    final, names, verdict = answer.applied, answer.names, answer.judgement.verdict
     in_doubt, rivals = _degeneracy_in_doubt(problem, answer.solved), [c for each in names.rivals for c in each]
 
     def next_step() -> str:
         text = recommended(problem, final.space, final.fit, rivals, verdict=verdict, before=before)
         return text + (CONFIRM if names.named and in_doubt else "")
 
-    fields = answer.told(
+    fields = answer.fields(
         recommended=next_step,
         descriptions=[
             f"{data.name}: {line}"
@@ -151,7 +151,7 @@ def _told(
             for line in in_words(tests)
         ],
         captures=[_capture(problem, k, final, before[k], after=after[k]) for k in range(len(problem.captures))],
-        unseen=unobservable(problem, answer.found),
+        unseen=unobservable(problem, answer.posterior),
         calibrated={},
         lasts=True,
     )
@@ -234,7 +234,7 @@ def _degeneracy_in_doubt(problem: SurfaceProblem, solved: Solution) -> bool:
 
 
 def _capture(
-    problem: SurfaceProblem, k: int, kept: Solution, before: dict[str, float], *, after: dict[str, float]
+    problem: SurfaceProblem, k: int, applied: Solution, before: dict[str, float], *, after: dict[str, float]
 ) -> CaptureReport:
     data = problem.captures[k]
     return CaptureReport(
@@ -244,8 +244,8 @@ def _capture(
         noise=data.noise,
         binned=1,
         clipped_fraction=data.clipped_fraction,
-        error_before=error(problem, kept.undone, kept.before.of(k), k),
-        error_after=error(problem, kept, kept.after.of(k), k),
+        error_before=error(problem, applied.undone, applied.before.of(k), k),
+        error_after=error(problem, applied, applied.after.of(k), k),
         tests_before=before,
         tests_after=after,
     )

@@ -100,7 +100,7 @@ class SurfaceProblem:
         out = []
         for k, data in enumerate(self.captures):
             w = self.rows(k, Space(()), np.zeros(0))
-            subset = data.kept(data.polarized(w[:, 0]))
+            subset = data.select(data.polarized(w[:, 0]))
             if len(subset.y) >= FEWEST_OF_MANY:
                 out.append(subset)
         if not out:
@@ -243,18 +243,16 @@ class SurfaceProblem:
             out.add(k, part, space.acting(k, data.wavelength_nm))
         return out
 
-    def derivatives(self, k: int, space: Space, values: Array, here: SurfacePixels) -> tuple[Array, Array]:
+    def derivatives(self, k: int, space: Space, values: Array, px: SurfacePixels) -> tuple[Array, Array]:
         """Derivatives (K, P, L) of the residual by every value, and (K, P) of the noise that is expected in it."""
-        d, less = np.empty((space.size, *here.residual.shape)), np.empty((space.size, len(here.most)))
+        d, less = np.empty((space.size, *px.residual.shape)), np.empty((space.size, len(px.most)))
         tile = self.captures[k].tile
-        before, noise = _left(here.strength * here.most, tile), self.noise[k].mean(axis=1)
+        before, noise = _left(px.strength * px.most, tile), self.noise[k].mean(axis=1)
         for j, (step, columns, flat, light) in enumerate(self._moved(k, space, values)):
-            change = (columns - here.columns) * here.alpha_0[:, None] + (flat - here.flat) * here.alpha_id[:, None]
-            d[j] = -here.outside(change + light - here.extra) / step
-            strength = np.sqrt(
-                np.sum((columns - here.e * np.sum(here.e * columns, axis=1, keepdims=True)) ** 2, axis=1)
-            )
-            less[j] = noise * (_left(strength * here.most, tile) - before) / step
+            change = (columns - px.columns) * px.alpha_0[:, None] + (flat - px.flat) * px.alpha_id[:, None]
+            d[j] = -px.outside(change + light - px.extra) / step
+            strength = np.sqrt(np.sum((columns - px.e * np.sum(px.e * columns, axis=1, keepdims=True)) ** 2, axis=1))
+            less[j] = noise * (_left(strength * px.most, tile) - before) / step
         return d, less
 
     def _moved(self, k: int, space: Space, values: Array) -> Iterator[tuple[float, Array, Array, Array]]:

@@ -59,12 +59,12 @@ def xi0_of(problem: SurfaceProblem, k: int, space: Space, values: Array) -> Arra
     return _xi0(problem.pixels(k, space, values))
 
 
-def _xi0(here: SurfacePixels) -> Array:
-    total = here.alpha_0 + here.alpha_id
+def _xi0(pixels: SurfacePixels) -> Array:
+    total = pixels.alpha_0 + pixels.alpha_id
     with np.errstate(divide="ignore", invalid="ignore"):
-        xi0 = (here.alpha_0 + here.alpha_id / 4) / total
+        xi0 = (pixels.alpha_0 + pixels.alpha_id / 4) / total
         # Where the model modulates little, xi0 is noise.
-        xi0[here.strength * total < SHOWS_XI0] = np.nan
+        xi0[pixels.strength * total < SHOWS_XI0] = np.nan
     return np.asarray(xi0, dtype=float)
 
 

@@ -51,7 +51,7 @@ def residual_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> A
     """Residual of each tile along its leading component, rms of each pixel, and xi0; before and after."""
     from matplotlib.figure import Figure as Picture
 
-    data, pairs = problem.captures[k], judged.found.ends
+    data, pairs = problem.captures[k], judged.solution.ends
     first = problem.pixels(k, pairs[0][0], pairs[0][1].values).residual
     _, vectors = np.linalg.eigh(first.T @ first)
     figure = Picture(figsize=(11, 6.4), layout="constrained")
@@ -84,7 +84,7 @@ def states_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> Any
 
     figure = Picture(figsize=(11, 2.6), layout="constrained")
     axis = figure.subplots()
-    for name, (space, fit) in zip(("before", "after"), judged.found.ends, strict=True):
+    for name, (space, fit) in zip(("before", "after"), judged.solution.ends, strict=True):
         pixels = problem.pixels(k, space, fit.values)
         rms = np.sqrt(np.mean(pixels.residual**2, axis=0) / np.mean(pixels.free * problem.noise[k], axis=0))
         axis.plot(rms, "o-", ms=3, label=name)
@@ -104,7 +104,7 @@ def dominant_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> A
     figure = Picture(figsize=(11, 2.9), layout="constrained")
     axes = figure.subplots(1, 4)
     names = (("psi / degree", 90.0), ("|D| / %", 50.0))
-    for column, (space, fit) in enumerate(judged.found.ends):
+    for column, (space, fit) in enumerate(judged.solution.ends):
         errors = dominant_errors(problem, k, space, fit.values, y=data.y) or ()
         for row, ((name, wide), error) in enumerate(zip(names, errors, strict=False)):
             axis = axes[2 * row + column]

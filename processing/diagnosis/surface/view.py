@@ -80,7 +80,7 @@ class SurfaceView:
         self._below: dict[tuple[object, ...], Array] = {}
         self._between: Between | None = None
 
-    def kept(self, pixels: NDArray[np.bool_]) -> SurfaceView:
+    def select(self, pixels: NDArray[np.bool_]) -> SurfaceView:
         """The same with some of the pixels alone."""
         out = copy(self)
         out.rays, out.points, out.normal = self.rays[pixels], self.points[pixels], self.normal[pixels]
@@ -183,13 +183,13 @@ class SurfaceView:
         return columns
 
 
-def _once(kept: dict[tuple[object, ...], Kept], key: tuple[object, ...], make: Callable[[], Kept]) -> Kept:
+def _once(cache: dict[tuple[object, ...], Kept], key: tuple[object, ...], make: Callable[[], Kept]) -> Kept:
     """What is kept of a key, made where it is not there yet."""
-    if key not in kept:
-        if len(kept) >= KEPT:
-            kept.clear()
-        kept[key] = make()
-    return kept[key]
+    if key not in cache:
+        if len(cache) >= KEPT:
+            cache.clear()
+        cache[key] = make()
+    return cache[key]
 
 
 class Between:

@@ -13,7 +13,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, information, shown, wanted_for_evidence
 from processing.diagnosis.search.decision import Judgement, held_out_check, refusal, rows_checks
 from processing.diagnosis.search.fit import HeldOut, Solution
-from processing.diagnosis.search.names import Names, told_answer
+from processing.diagnosis.search.names import Names, answer_of
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import (
     BeyondNoise,
@@ -103,21 +103,21 @@ def ties(values: Array, covariance: Array, typical: Array) -> Iterator[Tie]:
         )
 
 
-def combinations(found: Posterior, solved: Solution) -> tuple[Combination, ...]:
+def combinations(posterior: Posterior, solved: Solution) -> tuple[Combination, ...]:
     """Of the values of a correction, those that are only known together."""
     effects = set(solved.effects)
     at: list[int] = []
     names: list[str] = []
     units: list[str] = []
-    for candidate, part in found.space.pairs:
+    for candidate, part in posterior.space.pairs:
         if candidate in effects and not candidate.effect.per_state:
             at += range(part.start, part.stop)
             single = candidate.size == 1
             names += [candidate.label if single else f"{candidate.label} {p.name}" for p in candidate.parameters]
             units += [p.unit for p in candidate.parameters]
-    typical = found.space.joined("typical")[at]
+    typical = posterior.space.joined("typical")[at]
     result = []
-    for tie in ties(found.values[at], found.covariance[np.ix_(at, at)], typical):
+    for tie in ties(posterior.values[at], posterior.covariance[np.ix_(at, at)], typical):
         first = int(tie.index[np.argmin(np.abs(tie.weights - 1))])
         result.append(
             Combination(
@@ -166,14 +166,14 @@ def left_without(problem: Asked, solved: Solution, effects: Collection[Candidate
     return solved.after.and_more(more, float(sums.square.sum() - solved.fit.sums.square.sum()))
 
 
-def told_effects(
+def effects_of_cause(
     problem: Asked, solved: Solution, cause: Cause, doubt: str | None, *, not_applied: str | None
 ) -> list[FoundEffect]:
     """A cause as it is told, given a reason to doubt it; one for each capture in which it shows."""
     without = left_without(problem, solved, (*cause.candidates, *cause.alternatives))
     if not any(c in solved.space.candidates for c in (*cause.candidates, *cause.alternatives)):
         not_applied = not_applied or doubt or "it is not needed in addition to the other causes"
-    answer, probability = told_answer(cause, doubt)
+    answer, probability = answer_of(cause, doubt)
     effects = []
     # Of one with values of its own in every capture, those captures are told in which it shows.
     each = [
@@ -207,7 +207,7 @@ def told_effects(
     return effects
 
 
-def told_switches(problem: Asked, solved: Solution) -> list[FoundEffect]:
+def effects_of_switches(problem: Asked, solved: Solution) -> list[FoundEffect]:
     """Pixels that are left out because what they say is another thing than the others say."""
     effects = []
     for candidate, part in solved.space.pairs:
@@ -215,7 +215,7 @@ def told_switches(problem: Asked, solved: Solution) -> list[FoundEffect]:
             value, never = solved.fit.values[part], np.zeros((1, 1))
             gain = left_without(problem, solved, (candidate,)).excess - solved.after.excess
             cause = Cause((candidate,), (value,), (never,), probability=1.0, log_odds=gain / 2, alternatives=())
-            effects += told_effects(problem, solved, cause, None, not_applied=None) if gain > 2 * NEEDED else []
+            effects += effects_of_cause(problem, solved, cause, None, not_applied=None) if gain > 2 * NEEDED else []
     return effects
 
 
@@ -230,17 +230,17 @@ def _wavelength(problem: Asked, candidate: Candidate) -> float | None:
     return several.pop() if len(several) == 1 else candidate.wavelength_nm
 
 
-def ranking(found: Posterior, before: HeldOut) -> tuple[Ranked, ...]:
+def ranking(posterior: Posterior, before: HeldOut) -> tuple[Ranked, ...]:
     """Groups by what each would explain alone."""
-    form, groups = found.sets.form, found.sets.groups
+    form, groups = posterior.sets.form, posterior.sets.groups
     total = max(before.excess + before.freedom, 1e-300)
     alone = []
-    for k in np.flatnonzero(found.sets.free):
+    for k in np.flatnonzero(posterior.sets.free):
         g, h = form.gradient[groups[k].index], form.curvature[np.ix_(groups[k].index, groups[k].index)]
         alone.append((float(g @ np.linalg.solve(h + np.eye(g.size), g)), int(k)))
     return tuple(
         Ranked(
-            candidate=found.label(k).label,
+            candidate=posterior.label(k).label,
             evidence=round(gain, 1),
             rms_percent=100 * before.rms * float(np.sqrt(max(1 - gain / total, 0.0))),
         )
@@ -248,11 +248,11 @@ def ranking(found: Posterior, before: HeldOut) -> tuple[Ranked, ...]:
     )
 
 
-def unobservable(problem: Asked, found: Posterior) -> list[Candidate]:
+def unobservable(problem: Asked, posterior: Posterior) -> list[Candidate]:
     """Candidates about which the captures say nothing, the nominal values being free."""
-    precision, always = information(found)
+    precision, always = information(posterior)
     out = []
-    for candidate, part in found.space.pairs:
+    for candidate, part in posterior.space.pairs:
         if candidate.state_chosen or candidate.effect.is_switch or np.isin(part.start, always):
             continue
         least = np.full(candidate.size, SEEN)
@@ -289,7 +289,7 @@ class Answer:
     """
 
     problem: Asked
-    found: Posterior
+    posterior: Posterior
     solved: Solution
     names: Names
     judgement: Judgement
@@ -301,11 +301,11 @@ class Answer:
         return self.judgement.named or bool(self.names.untold)
 
     @property
-    def kept(self) -> Solution:
-        """What is applied."""
-        return self.judgement.kept(self.solved, self.any_cause)
+    def applied(self) -> Solution:
+        """The correction that is applied."""
+        return self.judgement.applied(self.solved, self.any_cause)
 
-    def told(
+    def fields(
         self,
         *,
         recommended: Callable[[], str],
@@ -326,8 +326,8 @@ class Answer:
         lasts : whether the correction may be used for later captures.
         uncertain : how wrong M may be still.
         """
-        problem, solved, final, names = self.problem, self.solved, self.kept, self.names
-        verdict, ranked = self.judgement.verdict, ranking(self.found, solved.before)
+        problem, solved, final, names = self.problem, self.solved, self.applied, self.names
+        verdict, ranked = self.judgement.verdict, ranking(self.posterior, solved.before)
         # What makes the residual worse is no cause, however well it fits.
         worse, refused = refusal(self.judgement.figures), self.judgement.refused
         tried = tuple(c.candidates[0].label for c in names.named)
@@ -340,7 +340,7 @@ class Answer:
                 *(
                     e
                     for c in names.named
-                    for e in told_effects(problem, solved, c, worse or names.doubt.get(c), not_applied=refused)
+                    for e in effects_of_cause(problem, solved, c, worse or names.doubt.get(c), not_applied=refused)
                 ),
                 *self.switched,
             ),
@@ -365,14 +365,14 @@ class Answer:
 
     def _correction(self, lasts: bool, uncertain: tuple[SystematicError, MuellerError] | None) -> Correction:
         """What a file would hold: means, with the spread over the sets; for these captures alone unless it `lasts`."""
-        post, solved, captures = self.found, self.solved, self.problem.captures
-        part = dict(post.space.pairs)
-        chance = {post.space.candidates[m]: p for g, p in enumerate(post.samples.probability) for m in post.members[g]}
+        posterior, solved, captures = self.posterior, self.solved, self.problem.captures
+        part, candidates = dict(posterior.space.pairs), posterior.space.candidates
+        chance = {candidates[m]: p for g, p in enumerate(posterior.samples.probability) for m in posterior.members[g]}
         effects = []
         for candidate, where in solved.space.pairs if self.any_cause else ():
             if candidate in solved.base.candidates:
                 continue
-            covariance = post.covariance[part[candidate], part[candidate]]
+            covariance = posterior.covariance[part[candidate], part[candidate]]
             for single, values, block in candidate.by_wavelength(solved.fit.values[where], covariance):
                 effects.append(
                     AppliedEffect(
@@ -390,7 +390,7 @@ class Answer:
             effects=tuple(effects),
             systematic=stored,
             mueller=mueller,
-            combinations=combinations(post, solved) if self.any_cause else (),
+            combinations=combinations(posterior, solved) if self.any_cause else (),
             checks=self.judgement.checks,
             refused=self.judgement.refused,
         )
