@@ -181,12 +181,12 @@ def _budget(sphere: SphereStudy, wavelengths: Sequence[float]) -> ReportSection:
 
 
 def _fault(fault: FaultStudy, wavelengths: Sequence[float]) -> ReportSection:
-    effects = []
+    lines = []
     for effect in fault.found.effects:
         values = ", ".join(f"{name} {value.told} {value.unit}" for name, value in effect.parameters.items())
-        effects.append((f"found: {effect.kind}", values))
+        lines.append((f"found: {effect.kind}", values))
     text = f"{FAULT['parameter']} of {FAULT['element']} is {FAULT['offset']:g} degrees off, which no file says"
-    summary = [("the fault", text), ("diagnose", f"{fault.found.verdict}. {fault.found.recommendation}"), *effects]
+    summary = [("the fault", text), ("diagnose", f"{fault.found.verdict}. {fault.found.recommendation}"), *lines]
     rows = [["", "Omega", *(f"{LABELS[name]}, {when}" for name in QUANTITIES for when in ("before", "after"))]]
     for before, after in zip(fault.before.rows, fault.after.rows, strict=True):
         key = (before.wavelength_nm, before.omega_deg)
