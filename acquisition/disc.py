@@ -109,7 +109,7 @@ class DiscProcess:
         """Have a function of a module called there; `frame`, if any, arrives as the argument of that name."""
         future: Future[T] = Future()
         if self.has_ended:
-            future.set_exception(_ended())
+            future.set_exception(_ended_error())
         else:
             self._jobs.put((future, (function, arguments), frame))
         return future
@@ -153,11 +153,11 @@ class DiscProcess:
             future, request, frame = job
             self._busy_since_s = time.monotonic()
             try:
-                self._line.send((*request, self._shared(frame), _folder()))
+                self._line.send((*request, self._share(frame), _folder()))
                 is_well, answer = self._line.recv()
             except (EOFError, ConnectionError):
                 self.has_ended = True
-                future.set_exception(_ended())
+                future.set_exception(_ended_error())
                 break
             except Exception as error:  # noqa: BLE001 - what cannot be sent fails, and the next call goes on
                 is_well, answer = False, error
@@ -171,11 +171,11 @@ class DiscProcess:
         with contextlib.suppress(queue.Empty):
             while True:
                 if (job := self._jobs.get_nowait()) is not None:
-                    job[0].set_exception(_ended())
+                    job[0].set_exception(_ended_error())
         self._line.close()
         self._frame.close()
 
-    def _shared(self, frame: NDArray[Any] | None) -> tuple[tuple[int, ...], str] | None:
+    def _share(self, frame: NDArray[Any] | None) -> tuple[tuple[int, ...], str] | None:
         if frame is None:
             return None
         np.copyto(self._frame.array(frame.shape, frame.dtype.str), frame)
@@ -189,7 +189,7 @@ def _folder() -> str | None:
     return None
 
 
-def _ended() -> AcquisitionError:
+def _ended_error() -> AcquisitionError:
     return AcquisitionError("the process that writes the captures has ended: out of memory, or somebody killed it")
 
 
@@ -261,7 +261,7 @@ def _serve(line: Connection, frame: SharedFrame, dies_with: int) -> NoReturn:
     global _is_child
     _is_child = True
     try:
-        _let_go_of_all_but(line.fileno(), frame.file)
+        _close_all_but(line.fileno(), frame.file)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1, signal.SIGTSTP):
             signal.signal(number, signal.SIG_IGN)
         signal.pthread_sigmask(signal.SIG_SETMASK, [])
@@ -295,7 +295,7 @@ def _send(line: Connection, answer: tuple[bool, Any]) -> None:
         line.send((False, AcquisitionError(f"the answer of the disc process cannot be sent: {error}")))
 
 
-def _let_go_of_all_but(*kept: int) -> None:
+def _close_all_but(*kept: int) -> None:
     """Close what was inherited; the standard streams lead nowhere, so that nobody waits for their end."""
     nothing = os.open(os.devnull, os.O_RDWR)
     for number in (0, 1, 2):

@@ -59,7 +59,7 @@ class StopRequest:
         finally:
             self._failing_here = False
 
-    def _failed(self, number: int, frame: FrameType | None) -> None:
+    def _raise_failure(self, number: int, frame: FrameType | None) -> None:
         if self._failing_here and self._failure is not None:
             failure, self._failure = self._failure, None
             raise failure
@@ -69,7 +69,7 @@ class StopRequest:
             self._count += 1
             return self._count
 
-    def _heard(self, number: int, frame: FrameType | None) -> None:
+    def _count_signal(self, number: int, frame: FrameType | None) -> None:
         count = self._add()
         # Each further one interrupts as well: what hangs after the second must not hold the program.
         if count >= self._patience:
@@ -80,8 +80,8 @@ class StopRequest:
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._heard)
-            self._previous[FAILED] = signal.signal(FAILED, self._failed)
+                self._previous[number] = signal.signal(number, self._count_signal)
+            self._previous[FAILED] = signal.signal(FAILED, self._raise_failure)
         return self
 
     def __exit__(self, *_: object) -> None:

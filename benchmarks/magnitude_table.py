@@ -53,11 +53,11 @@ def node(components: float, share: float) -> np.ndarray:
     for level in LEVELS:
         low, high = acceptance(cumulative, level).T
         # theta is in the interval of r where low <= r <= high.
-        out += [_lower(OBSERVED, high, _THETA), np.interp(OBSERVED, low, _THETA)]
+        out += [_lower_bound(OBSERVED, high, _THETA), np.interp(OBSERVED, low, _THETA)]
     return np.array(out)
 
 
-def _lower(observed: np.ndarray, high: np.ndarray, theta: np.ndarray) -> np.ndarray:
+def _lower_bound(observed: np.ndarray, high: np.ndarray, theta: np.ndarray) -> np.ndarray:
     """Lower bound, continued below zero as an odd function about where it leaves zero: so interpolation keeps that."""
     first = high[0]
     return np.interp(observed, high, theta, left=0.0) - np.interp(2 * first - observed, high, theta, left=0.0)
@@ -74,7 +74,7 @@ def sums() -> np.ndarray:
         below = (1 - level) / 2 * (1 - np.exp(-(theta**2) / 8))
         low = [np.quantile(each, p) if p else 0.0 for each, p in zip(samples, below, strict=True)]
         high = [np.quantile(each, p + level) for each, p in zip(samples, below, strict=True)]
-        out += [_lower(SUMS, np.asarray(high), theta), np.interp(SUMS, low, theta)]
+        out += [_lower_bound(SUMS, np.asarray(high), theta), np.interp(SUMS, low, theta)]
     return np.array(out)
 
 

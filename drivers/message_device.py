@@ -65,7 +65,7 @@ class MessageDevice:
         try:
             os.write(self._file, f"{message}\n".encode("ascii"))
         except OSError as error:
-            raise self._lost(error) from error
+            raise self._loss(error) from error
 
     def read(self, timeout_s: float) -> str | None:
         """The next message, without its line end (CR, LF or both); None if none comes in time."""
@@ -90,7 +90,7 @@ class MessageDevice:
         except TimeoutError:
             return None
         except OSError as error:
-            raise self._lost(error) from error
+            raise self._loss(error) from error
 
     def drop_input(self) -> None:
         """Throw away what waits; an instrument on USBTMC keeps an answer until it is asked for."""
@@ -109,6 +109,6 @@ class MessageDevice:
             os.close(self._file)
         self._file = -1
 
-    def _lost(self, error: OSError) -> PortLost:
+    def _loss(self, error: OSError) -> PortLost:
         reason = errno.errorcode.get(error.errno or 0, str(error))
         return PortLost(f"use {self.port}", f"it is gone ({reason})", "Check cable and power, then start again")

@@ -126,7 +126,7 @@ class Motion:
             self._result = self._last
             axis._do_note_rest(self._last.counts)
         elif axis._stops != self._stops_before:
-            raise self._failed(MotionStopped, "stopped on request", what_to_do="Start a new move when it is safe")
+            raise self._make_error(MotionStopped, "stopped on request", what_to_do="Start a new move when it is safe")
         elif self._idle_since_s is None:
             self._idle_since_s = now_s
         elif now_s - self._idle_since_s > SETTLE_S:
@@ -142,7 +142,7 @@ class Motion:
         elif self.target_deg is not None and now_s - self._progress_s > stall_s:
             raise self._stop_and_describe(f"stalled: it says it moves but made no progress for {stall_s:.2f} s")
 
-    def _failed(self, kind: type[MotionFailed], why: str, **more: str) -> MotionFailed:
+    def _make_error(self, kind: type[MotionFailed], why: str, **more: str) -> MotionFailed:
         elapsed_s = self.axis.clock.now_s() - self._start_s
         last_deg = None if self._last is None else self._last.deg
         more["unit"] = self.axis.config.unit
@@ -154,7 +154,7 @@ class Motion:
             self.axis.stop()
         except DeviceError as error:
             why = f"{why}; and the stop failed too ({error})"
-        return self._failed(MotionFailed, why)
+        return self._make_error(MotionFailed, why)
 
 
 class MotionAxis(ABC):

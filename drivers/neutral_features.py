@@ -201,7 +201,7 @@ class NeutralFeatures:
     def _load(self) -> Iterator[str]:
         """Load the default user set; yields what is left unknown."""
         if self._user_set is None:
-            yield from self._unknown("no user set is loaded (`user_set: null`)")
+            yield from self._remark_unknown("no user set is loaded (`user_set: null`)")
             return
         features = self._features
         if features.find(("DefaultSetSelector",)) is not None and "Standard" in features.choices("DefaultSetSelector"):
@@ -219,12 +219,12 @@ class NeutralFeatures:
             except CameraLost:
                 raise
             except CameraError as error:
-                yield from self._unknown(f"the default settings were not loaded ({error.came_back})")
+                yield from self._remark_unknown(f"the default settings were not loaded ({error.came_back})")
                 return
             if probe is not None and self._value(probe[0]) == probe[1]:
-                yield from self._unknown(f"{load} of {preset} changed nothing, {probe[0]} stayed as it was")
+                yield from self._remark_unknown(f"{load} of {preset} changed nothing, {probe[0]} stayed as it was")
             return
-        yield from self._unknown("this camera has no default settings to load")
+        yield from self._remark_unknown("this camera has no default settings to load")
 
     def _probe(self) -> tuple[str, float] | None:
         """Set the exposure to a value that no default has, so that a load that does nothing is seen."""
@@ -238,7 +238,7 @@ class NeutralFeatures:
                 return name, back
         return None
 
-    def _unknown(self, why: str) -> Iterator[str]:
+    def _remark_unknown(self, why: str) -> Iterator[str]:
         names = [
             name
             for name in self._features.writable()

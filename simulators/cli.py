@@ -69,7 +69,7 @@ def serve(
         emulator = kinds[kind](options)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
-    with _signalled() as ended, port_for(emulator) as port:
+    with _stop_event() as ended, port_for(emulator) as port:
         typer.echo(port.path)
         sys.stdout.flush()
         while not ended.wait(0.2) and port.is_serving():
@@ -93,7 +93,7 @@ def rig(
 
     try:
         with (
-            _signalled() as ended,
+            _stop_event() as ended,
             served_rig.serve(rig_file, out, sample, mode, wavelength_nm=wavelength, omega_deg=omega),
         ):
             typer.echo(out)
@@ -105,7 +105,7 @@ def rig(
 
 
 @contextmanager
-def _signalled() -> Iterator[threading.Event]:
+def _stop_event() -> Iterator[threading.Event]:
     """An event that SIGTERM and Ctrl-C set; afterwards they do what they did before."""
     event = threading.Event()
     before = {number: signal.signal(number, lambda *_: event.set()) for number in (signal.SIGTERM, signal.SIGINT)}

@@ -82,7 +82,7 @@ def application(folder: Path, token: str) -> Starlette:
     app = Starlette(
         routes=[Mount(f"/{token}", routes=routes)],
         middleware=[Middleware(PageGuard, token=token)],
-        exception_handlers={ProcessError: _refused},
+        exception_handlers={ProcessError: _refusal_page},
     )
     app.state.pages = Pages(Library(folder), f"/{token}", f"/{token}/{PLOTLY.name}")
     return app
@@ -96,7 +96,7 @@ async def _plotly(request: Request) -> Response:
     return FileResponse(PLOTLY, headers={"Cache-Control": "private, max-age=31536000, immutable"})
 
 
-async def _refused(request: Request, error: Exception) -> Response:
+async def _refusal_page(request: Request, error: Exception) -> Response:
     code = 404 if isinstance(error, NotHere) else 422
     if "text/html" in request.headers.get("accept", ""):
         return pages_of(request).draw("refused.html", code=code, text=str(error))

@@ -122,14 +122,14 @@ def read_campaign(folder: Path, library: Library, running: str | None = None) ->
         for number, (name, plan) in enumerate(plans.items(), 1)
     }
     events = list(_events(folder / LOG))
-    bars = (_as_in_grid(bar, cells.get(bar.name), entries.get(bar.name)) for bar in _bars(events))
+    bars = (_match_grid(bar, cells.get(bar.name), entries.get(bar.name)) for bar in _bars(events))
     return CampaignView(
         name=library.name(folder),
         simulated=bool(identity.get("simulated")),
         rig_file=str(identity.get("rig_file", "")),
         cells=tuple(cells.values()),
         bars=tuple(bars),
-        events=tuple((str(e.get("time", "")), _in_words(e)) for e in reversed(events[-100:])),
+        events=tuple((str(e.get("time", "")), _event_text(e)) for e in reversed(events[-100:])),
     )
 
 
@@ -204,7 +204,7 @@ def _bars(events: list[dict[str, Any]]) -> Iterator[Bar]:
         yield Bar(*started, None, "running")
 
 
-def _as_in_grid(bar: Bar, cell: Cell | None, entry: Entry | None) -> Bar:
+def _match_grid(bar: Bar, cell: Cell | None, entry: Entry | None) -> Bar:
     """The bar with what the log does not say: that a capture has a flag, or that its run was killed, and when."""
     if cell is not None and (bar.status, cell.status) == ("done", "flagged"):
         return replace(bar, status="flagged")
@@ -215,7 +215,7 @@ def _as_in_grid(bar: Bar, cell: Cell | None, entry: Entry | None) -> Bar:
     return bar
 
 
-def _in_words(event: dict[str, Any]) -> str:
+def _event_text(event: dict[str, Any]) -> str:
     parts = [str(event.get("event"))]
     parts += [str(event[key]) for key in ("capture", "at", "error", "why") if event.get(key)]
     if event.get("status"):

@@ -181,13 +181,13 @@ def _systematic_errors(first: Product, second: Product, query: Any, window: Wind
     Products with the same uncertain inputs are of one instrument: its error leaves the difference as far as it moves
     both alike. Where only the size of both errors is known, they add.
     """
-    (move_a, a), (move_b, b) = (_moved(product, query, window) for product in (first, second))
+    (move_a, a), (move_b, b) = (_shifts(product, query, window) for product in (first, second))
     if first.facts.get(INPUTS) != second.facts.get(INPUTS):
         return np.asarray(np.hypot(a, b))
     return np.asarray(a + b if move_a is None or move_b is None else np.sqrt(np.square(move_a - move_b).sum(axis=0)))
 
 
-def _moved(product: Product, query: Any, window: Window) -> tuple[NDArray[np.floating] | None, NDArray[np.floating]]:
+def _shifts(product: Product, query: Any, window: Window) -> tuple[NDArray[np.floating] | None, NDArray[np.floating]]:
     """What each uncertain input of the instrument does to a map (D, rows, columns), if known, and their size."""
     name, index = asked_of(product, query)
     moved = None

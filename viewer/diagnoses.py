@@ -171,7 +171,7 @@ class Diagnoses:
         """
         if not re.fullmatch(r"[\w. -]+\.yaml", file) or file.startswith("."):
             raise ProcessError(f"{file!r}: give a plain file name that ends in .yaml")
-        story, folder = self._undecided(name), self.folder(name)
+        story, folder = self._require_undecided(name), self.folder(name)
         model, path = InstrumentModel.load(folder / "instrument.yaml"), self._library.root / file
         if isinstance(story.diagnosis, SurfaceDiagnosis):
             material = load_reflectance(folder / "material.yaml")
@@ -186,10 +186,10 @@ class Diagnoses:
 
     def reject(self, name: str, note: str) -> None:
         """Note that the model is not believed, and why. Raises ProcessError where it is decided already."""
-        self._undecided(name)
+        self._require_undecided(name)
         self._decide(name, {"accepted": False, "note": note})
 
-    def _undecided(self, name: str) -> Story:
+    def _require_undecided(self, name: str) -> Story:
         story = self.story(name)
         if story.decision is not None:
             raise ProcessError("this diagnosis was decided already; reload the page")

@@ -47,11 +47,11 @@ def seen(folder: Path, library: Library) -> dict[str, Any]:
     state |= {key: run.get(key) for key in ("title", "activity", "done", "pending", "left_s", "messages", "capture")}
     state |= {"number": run.get("campaign_done", 0) + 1, "total": run.get("campaign_total", 1)}
     state["axes"] = run.get("axes") or {}
-    state |= _taken(folder / str(run.get("capture")), library)
+    state |= _current_capture(folder / str(run.get("capture")), library)
     return state
 
 
-def _taken(final: Path, library: Library) -> dict[str, Any]:
+def _current_capture(final: Path, library: Library) -> dict[str, Any]:
     """The capture that is being taken, or was just sealed: its file, states done, and the lamp."""
     for path in (final.with_name(final.name + PARTIAL), final):
         if library.holds(path):

@@ -33,16 +33,16 @@ def lamp(capture: Capture) -> dict[str, Any]:
         return {"states": [], "ratio": [], "told": str(error)}
     if fitted is not None:
         method = "dark-corrected mean of each state over what polarization makes of it by the other states"
-        return _told(capture, light, signal / fitted, method)
+        return _lamp_entry(capture, light, signal / fitted, method)
     same = _repeats(capture, light)
     if same.sum() > 1:
         method = f"dark-corrected mean of the {int(same.sum())} states that repeat the pose of the first one"
-        return _told(capture, light[same], signal[same] / signal[same][0], method)
+        return _lamp_entry(capture, light[same], signal[same] / signal[same][0], method)
     method = "shown once enough states separate the lamp from polarization"
     return {"states": [], "ratio": [], "told": method}
 
 
-def _told(capture: Capture, states: NDArray[np.int64], ratio: NDArray[np.float64], told: str) -> dict[str, Any]:
+def _lamp_entry(capture: Capture, states: NDArray[np.int64], ratio: NDArray[np.float64], told: str) -> dict[str, Any]:
     keep = np.isfinite(ratio)
     return {"states": capture.done[states][keep].tolist(), "ratio": ratio[keep].tolist(), "told": told}
 
@@ -79,10 +79,10 @@ def _fitted(capture: Capture, light: NDArray[np.int64], signal: NDArray[np.float
     is_finite = np.isfinite(signal)
     if is_finite.sum() < np.linalg.matrix_rank(w[is_finite], rtol=1e-6) + SPARE:
         return None
-    return np.asarray(_from_the_others(w, signal, is_finite))
+    return np.asarray(_predict_from_others(w, signal, is_finite))
 
 
-def _from_the_others(
+def _predict_from_others(
     w: NDArray[np.float64], signal: NDArray[np.float64], known: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """What the other states make of each one: a fit with all of them would follow a flash halfway."""

@@ -27,10 +27,10 @@ from viewer.probing import PixelReducer, Region, curve, finite, matrix, raw_curv
 
 def curve_of(request: Request) -> JSONResponse:
     """Intensities of a pixel or a region of a capture, with the fitted curve where there can be one."""
-    return JSONResponse(_curve_of(file_of(request), request.query_params))
+    return JSONResponse(_capture_probe(file_of(request), request.query_params))
 
 
-def _curve_of(path: Path, query: Any) -> dict[str, Any]:
+def _capture_probe(path: Path, query: Any) -> dict[str, Any]:
     with Capture(path) as capture:
         region = Region.asked(query, capture.frame_shape)
         raw = raw_curve(capture, region, chosen(capture, {"channel": query.get("channel", 0)})[1])
@@ -71,11 +71,11 @@ def _fit(path: Path, region: Region, instrument: Path | None) -> dict[str, Any]:
 def reducer_of(path: Path, instrument: Path | None) -> PixelReducer | SuperPixelReducer:
     """What reduces single pixels of a capture, or super-pixels; kept while its files stay as they are."""
     changed = [p.stat().st_mtime_ns for p in (path, instrument) if p is not None]
-    return _kept(path, instrument, tuple(changed))
+    return _make_reducer(path, instrument, tuple(changed))
 
 
 @lru_cache(maxsize=4)
-def _kept(path: Path, instrument: Path | None, changed: tuple[int, ...]) -> PixelReducer | SuperPixelReducer:
+def _make_reducer(path: Path, instrument: Path | None, changed: tuple[int, ...]) -> PixelReducer | SuperPixelReducer:
     with Capture(path) as capture:
         stokes = capture.reduces_to == "stokes"
     return SuperPixelReducer(path, instrument) if stokes else PixelReducer(path, instrument)
@@ -83,10 +83,10 @@ def _kept(path: Path, instrument: Path | None, changed: tuple[int, ...]) -> Pixe
 
 def of_product(request: Request) -> JSONResponse:
     """What a product says of a pixel or a region, and the intensities behind it where the capture is at hand."""
-    return JSONResponse(_of_product(file_of(request), request.query_params, pages_of(request).library))
+    return JSONResponse(_product_probe(file_of(request), request.query_params, pages_of(request).library))
 
 
-def _of_product(path: Path, query: Any, library: Library) -> dict[str, Any]:
+def _product_probe(path: Path, query: Any, library: Library) -> dict[str, Any]:
     with Product(path) as product:
         shape = product.shape
         region = Region.asked(query, shape)

@@ -91,13 +91,13 @@ class PixelReducer:
 
     def __init__(self, path: Path, instrument: Path | None = None) -> None:
         self._path = path
-        with self._opened() as capture:
+        with self._open() as capture:
             #: Rows and columns of the frame to one of the image.
             self._cell = capture.stored_shape[0] // capture.frame_shape[0]
             self.channels = capture.channel_names
             self.reduction = MuellerReduction.of(capture, choose_model(capture, instrument))
 
-    def _opened(self) -> Capture:
+    def _open(self) -> Capture:
         return Capture(self._path, by_super_pixel=True)
 
     def image(self, region: Region) -> tuple[MuellerImage, NDArray[np.float64]]:
@@ -112,7 +112,7 @@ class PixelReducer:
         region = region.reduced(self._cell)
         if region.pixels * self.reduction.w.size // 16 > MOST:
             raise ProcessError(f"{region} is more than is reduced at once; draw a smaller one")
-        with self._opened() as capture:
+        with self._open() as capture:
             try:
                 return self.reduction.region(capture, region.rows, region.columns)
             except ProcessError as error:

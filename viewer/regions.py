@@ -112,7 +112,7 @@ def regions(request: Request) -> JSONResponse:
     path, query = file_of(request), request.query_params
     image = MeasuredImage(path)
     named = [("", Region.asked(query, image.shape))] if "x0" in query else []
-    named += _named(pages_of(request).library, image.shape)
+    named += _named_areas(pages_of(request).library, image.shape)
     return JSONResponse({"regions": [image.row(name, region, query) for name, region in named]})
 
 
@@ -124,7 +124,7 @@ def table(request: Request) -> Response:
     text.write(f"# {path.name}\n" + ("# SIMULATED data\n" if image.simulated else ""))
     lines = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
     lines.writeheader()
-    for name, region in _named(pages_of(request).library, image.shape):
+    for name, region in _named_areas(pages_of(request).library, image.shape):
         for choice in image.choices:
             row = image.row(name, region, {"index": 0} | choice)
             lines.writerow({**row, "region": name, "quantity": choice["label"]})
@@ -136,7 +136,7 @@ def table(request: Request) -> Response:
     )
 
 
-def _named(library: Library, shape: tuple[int, int]) -> list[tuple[str, Region]]:
+def _named_areas(library: Library, shape: tuple[int, int]) -> list[tuple[str, Region]]:
     return [(region.name, area) for region in kept_regions(library) if (area := region.on(shape)) is not None]
 
 
@@ -187,7 +187,7 @@ class MeasuredImage:
         if not count:
             return row | {"histogram": {"edges": [], "pixels": []}, "columns": [], "rows": []}
         mean = float(_mean(pixels.values[good], pixels.period, 0))
-        off = _apart(pixels.values - mean, pixels.period)
+        off = _wrap(pixels.values - mean, pixels.period)
         value, error, systematic = pixels.mean or (mean, _error(pixels, good), _systematic(pixels, good))
         edges = _edges(pixels.values[good] if pixels.period is None else mean + off[good])
         return row | {
@@ -266,7 +266,7 @@ def _mean(values: NDArray[np.float64], period: float | None, axis: int) -> NDArr
     return np.asarray(np.angle(turns) / (2 * np.pi) * period % period)
 
 
-def _apart(off: NDArray[np.float64], period: float | None) -> NDArray[np.float64]:
+def _wrap(off: NDArray[np.float64], period: float | None) -> NDArray[np.float64]:
     return off if period is None else np.asarray((off + period / 2) % period - period / 2)
 
 

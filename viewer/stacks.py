@@ -112,7 +112,7 @@ def _points(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
     for entry in _chosen(pages, query.get("kind", ""), query.get("q", "")):
         path = pages.library.path(entry.name)
         try:
-            image, time = _opened(path, path.stat().st_mtime_ns)
+            image, time = _open_image(path, path.stat().st_mtime_ns)
             region = Region(*parse_region(None, image.shape)) if where == MIDDLE else named[where].on(image.shape)
             if region is None:
                 reasons.append(f"the image has another form than region {where}")
@@ -128,6 +128,6 @@ def _points(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
 
 
 @lru_cache(maxsize=MOST_FILES)
-def _opened(path: Path, changed: int) -> tuple[MeasuredImage, str]:
+def _open_image(path: Path, changed: int) -> tuple[MeasuredImage, str]:
     with Product(path) as product:
         return MeasuredImage(path), taken_at(product)

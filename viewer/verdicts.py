@@ -38,7 +38,7 @@ def diagnosis(request: Request) -> HTMLResponse:
         found=result,
         proposed=_free_name(pages.library.root, story.model),
         captures=[(capture, pages.address("capture", file=capture)) for capture in story.captures],
-        look={"captures": [_told(residual) for residual in residuals]},
+        look={"captures": [_residual_entry(residual) for residual in residuals]},
         colours={name: steps(name) for name in ALL},
     )
 
@@ -51,7 +51,7 @@ def _free_name(folder: Path, model: str) -> str:
     return f"{stem}_{number}.yaml"
 
 
-def _told(residual: StoredResidual) -> dict[str, Any]:
+def _residual_entry(residual: StoredResidual) -> dict[str, Any]:
     rows, columns = residual.images["before"].shape[-2:]
     loud = [_rms(residual, moment) for moment in MOMENTS]
     valid = np.concatenate([image[np.isfinite(image)] for image in loud])

@@ -125,18 +125,18 @@ class CameraDevice(BlueskyDevice):
         def expose() -> None:
             with self.turn:
                 self._frame = self.rig.require_camera().capture(1)[0].pixels
-                if self._in_files:
+                if self._writes_files:
                     self._path = write_frame(Path(self.folder or ""), self.name, self._frame, self.exposure_s)
 
         return in_background(expose)
 
     @property
-    def _in_files(self) -> bool:
+    def _writes_files(self) -> bool:
         return self.tells_frames and self.folder is not None
 
     def read(self) -> Readings:
         """The frame that was taken last, unless it is in a file, and its mean in counts."""
-        has_frame = self.tells_frames and not self._in_files
+        has_frame = self.tells_frames and not self._writes_files
         frame = {f"{self.name}_frame": self._frame} if has_frame else {}
         return readings(frame | {f"{self.name}_mean": float(self._frame.mean())})
 
@@ -145,7 +145,7 @@ class CameraDevice(BlueskyDevice):
         settings = self.rig.require_camera().settings
         shape = (settings.height or 0, settings.width or 0)
         keys = {f"{self.name}_mean": data_key("camera, mean of the frame", (), "count")}
-        if self._in_files:
+        if self._writes_files:
             keys[f"{self.name}_frame"] = in_file(data_key("camera, counts (1, row, column)", (1, *shape), "count"))
         elif self.tells_frames:
             keys[f"{self.name}_frame"] = data_key("camera, counts (row, column)", shape, "count")
@@ -153,5 +153,5 @@ class CameraDevice(BlueskyDevice):
 
     def collect_asset_docs(self, index: int | None = None) -> Documents:
         """Where the frame that was taken last is."""
-        if self._in_files:
+        if self._writes_files:
             yield from asset_documents(f"{self.name}_frame", self._path, FRAME, (1, *self._frame.shape))

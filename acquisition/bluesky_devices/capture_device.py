@@ -161,14 +161,14 @@ class CaptureDevice(BlueskyDevice):
     def _column(self, axis: str) -> tuple[str, str]:
         return position_column(f"{self.name}_{axis}", self.rig.config.axes[axis].unit == "V")
 
-    def _sealed(self) -> Path:
+    def _require_path(self) -> Path:
         if self._path is None:
             raise AcquisitionError(f"{self.name} has taken no capture yet; trigger it first.")
         return self._path
 
     def read(self) -> Readings:
         """File, angles as read back and columns, of the capture that was taken last."""
-        with Capture(self._sealed()) as capture:
+        with Capture(self._require_path()) as capture:
             values: dict[str, Any] = {f"{self.name}_file": str(capture.path)}
             values |= {self._column(axis)[0]: angles for axis, angles in capture.angles_deg.items()}
             values |= {f"{self.name}_{column}": capture.column(column) for column in COLUMNS}

@@ -62,7 +62,7 @@ def require_same_campaign(folder: Path, now: dict[str, Any]) -> None:
     then = read_identity(folder)
     if then is None:
         return
-    changes = list(dict.fromkeys(_found(then, now)))
+    changes = list(dict.fromkeys(_changes(then, now)))
     if changes:
         started = f"it was started with --rig {then.get('rig_file')}"
         raise Differs(
@@ -70,7 +70,7 @@ def require_same_campaign(folder: Path, now: dict[str, Any]) -> None:
         )
 
 
-def _found(then: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
+def _changes(then: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
     for key in now:
         if key not in then and key == "device":
             continue

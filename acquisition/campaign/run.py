@@ -220,7 +220,7 @@ class CampaignRun:
 
     def _take_once(self, capture: CampaignCapture, job: Job, rig: Rig) -> Result:
         final = self.folder.folder / capture.name
-        partial = on_disc(f"look at {final}", _begun, final)
+        partial = on_disc(f"look at {final}", _existing_file, final)
         if partial is not None:
             job = on_disc(f"read {partial}", job_of, partial, self.config, capture.plan)
             refuse_failed(check_with_devices(job, rig, final.parent))
@@ -280,7 +280,7 @@ class CampaignRun:
 # --- what the disc process does --------------------------------------------------------------------------------------
 
 
-def _begun(final: Path) -> Path | None:
+def _existing_file(final: Path) -> Path | None:
     """The file of a capture that is there, under its final name (aborted by Ctrl-C, or whole) or its partial one."""
     return next((path for path in (final, final.with_name(final.name + PARTIAL)) if path.exists()), None)
 
@@ -299,7 +299,7 @@ def _is_complete(path: Path, plan: MeasurementPlan, config: RigConfig, instrumen
 
 
 def _states_in(final: Path) -> int:
-    path = _begun(final)
+    path = _existing_file(final)
     try:
         if path is not None:
             with Capture(path) as capture:

@@ -27,11 +27,11 @@ def summary_lines(folder: Path, names: Sequence[str], index: Mapping[str, Mappin
     """
     status = {name: str(index.get(name, {}).get("status", "not begun")) for name in names}
     counts = Counter(status.values())
-    lines = [f"{counts['complete']} of {len(names)} captures complete" + _others(counts)]
+    lines = [f"{counts['complete']} of {len(names)} captures complete" + _breakdown(counts)]
     for word in sorted(set(status.values()) - {"complete", "not begun"}):
-        lines += _named(word, [name for name in names if status[name] == word], index)
+        lines += _list_captures(word, [name for name in names if status[name] == word], index)
     bright = [name for name in names if (index.get(name, {}).get("saturated_fraction") or 0) > SATURATED]
-    lines += _named("saturated", bright, {})
+    lines += _list_captures("saturated", bright, {})
     events = _events(folder)
     if events:
         lines.append(f"first started {events[0]['time']}, last word {events[-1]['time']}")
@@ -42,17 +42,17 @@ def summary_lines(folder: Path, names: Sequence[str], index: Mapping[str, Mappin
     return lines
 
 
-def _others(counts: Counter[str]) -> str:
+def _breakdown(counts: Counter[str]) -> str:
     tallies = [f"{count} {word}" for word, count in sorted(counts.items()) if word != "complete"]
     return f" ({', '.join(tallies)})" if tallies else ""
 
 
-def _named(word: str, names: Sequence[str], index: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    lines = [f"{word}: {name}" + _why(index.get(name, {})) for name in names[:NAMED]]
+def _list_captures(word: str, names: Sequence[str], index: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    lines = [f"{word}: {name}" + _error_text(index.get(name, {})) for name in names[:NAMED]]
     return lines + ([f"{word}: and {len(names) - NAMED} more"] if len(names) > NAMED else [])
 
 
-def _why(entry: Mapping[str, Any]) -> str:
+def _error_text(entry: Mapping[str, Any]) -> str:
     error = entry.get("error")
     return f" ({' '.join(str(error).split())})" if error else ""
 

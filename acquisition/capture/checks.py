@@ -111,7 +111,7 @@ def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) 
         if beyond:
             allowed = f"the limits are {limits} {unit} (limits_deg of the rig file)"
             text = f"{beyond[0]:g} {unit}; {allowed}. Change the plan"
-            return [CheckResult(f"limits of {axis}", False, text + _could_fold(axis, rig))]
+            return [CheckResult(f"limits of {axis}", False, text + _fold_hint(axis, rig))]
     checks = _free_ways(rig, states_deg(table))
     lacking = [axis for axis in instrument.axes if axis not in table.angles_deg]
     if lacking:
@@ -187,7 +187,7 @@ def check_devices(
             for target in column:
                 rig.axes[axis].check(float(target))
         except LimitError as error:
-            checks.append(CheckResult(f"limits of {axis}", False, str(error) + _could_fold(axis, rig.config)))
+            checks.append(CheckResult(f"limits of {axis}", False, str(error) + _fold_hint(axis, rig.config)))
         else:
             ends = f"{column.min():g} to {column.max():g} {rig.config.axes[axis].unit}"
             checks.append(CheckResult(f"limits of {axis}", True, ends))
@@ -216,7 +216,7 @@ def _check_park(rig: Rig) -> list[CheckResult]:
     return failures
 
 
-def _could_fold(axis: str, rig: RigConfig) -> str:
+def _fold_hint(axis: str, rig: RigConfig) -> str:
     if axis == ARM or axis in rig.fold_deg or rig.axes[axis].unit != "deg":
         return ""
     return (

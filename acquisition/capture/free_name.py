@@ -30,31 +30,31 @@ def free_name(path: Path) -> Iterator[Path]:
     finally:
         # Not there any more once the capture has begun.
         with suppress(OSError, AcquisitionError):
-            on_disc(f"remove {_with(free, NEW)}", _with(free, NEW).unlink, missing_ok=True)
+            on_disc(f"remove {_append_ending(free, NEW)}", _append_ending(free, NEW).unlink, missing_ok=True)
 
 
 def _take(path: Path) -> Path:
     make_folder(path.parent)
-    return next(name for name in _numbered(path) if _taken_hold_of(name))
+    return next(name for name in _candidates(path) if _claim(name))
 
 
-def _numbered(path: Path) -> Iterator[Path]:
+def _candidates(path: Path) -> Iterator[Path]:
     yield path
     yield from (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
 
 
-def _taken_hold_of(path: Path) -> bool:
+def _claim(path: Path) -> bool:
     """Whether the capture may have this name; if so, its first file stands for it from now on."""
     try:
-        os.close(os.open(_with(path, NEW), os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666))
+        os.close(os.open(_append_ending(path, NEW), os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666))
     except FileExistsError:
         return False
     # Looked at in the order in which a capture changes its name, so that none slips through between two looks.
-    if _with(path, PARTIAL).exists() or path.exists():
-        _with(path, NEW).unlink()
+    if _append_ending(path, PARTIAL).exists() or path.exists():
+        _append_ending(path, NEW).unlink()
         return False
     return True
 
 
-def _with(path: Path, ending: str) -> Path:
+def _append_ending(path: Path, ending: str) -> Path:
     return path.with_name(path.name + ending)

@@ -66,7 +66,7 @@ def rig_content(config: RigConfig, mode: str) -> Any:
     """A rig file without places, files and the modes that this capture does not use."""
     tree = config.model_dump(mode="python", exclude_none=True)
     tree["modes"] = {mode: tree["modes"][mode]}
-    return json.loads(json.dumps(_without(tree), default=str))
+    return json.loads(json.dumps(_strip_places(tree), default=str))
 
 
 def files_of(config: RigConfig, mode: str) -> dict[str, str]:
@@ -149,22 +149,22 @@ def differences(then: Any, now: Any, key: str) -> Iterator[str]:
         for number, (a, b) in enumerate(zip(then, now, strict=True)):
             yield from differences(a, b, f"{key}[{number}]")
     elif then != now:
-        yield f"{key}: {_said(then)} at the start, {_said(now)} now"
+        yield f"{key}: {_shorten(then)} at the start, {_shorten(now)} now"
 
 
-def _said(value: Any) -> str:
+def _shorten(value: Any) -> str:
     text = "nothing" if value is None else str(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _without(tree: Any) -> Any:
+def _strip_places(tree: Any) -> Any:
     if isinstance(tree, dict):
         return {
-            str(key): _without(value)
+            str(key): _strip_places(value)
             for key, value in tree.items()
             if key not in PLACES and not isinstance(value, Path)
         }
-    return [_without(value) for value in tree] if isinstance(tree, list | tuple) else tree
+    return [_strip_places(value) for value in tree] if isinstance(tree, list | tuple) else tree
 
 
 def _paths(tree: Any, key: str) -> Iterator[tuple[str, Path]]:

@@ -26,9 +26,9 @@ def seen_by_camera(instrument: InstrumentModel, camera: Camera) -> InstrumentMod
         )
     if instrument.mosaic is None and not who.colours:
         return instrument
-    wrong = _unknown(settings, camera.bins_like_with_like)
+    wrong = _phase_problem(settings, camera.bins_like_with_like)
     if instrument.mosaic is not None:
-        wrong = wrong or _torn(instrument.mosaic, settings) or _named_otherwise(instrument.mosaic, who)
+        wrong = wrong or _size_problem(instrument.mosaic, settings) or _name_problem(instrument.mosaic, who)
     if wrong is not None:
         raise AcquisitionError(wrong)
     if instrument.mosaic is None:
@@ -61,7 +61,7 @@ def colours_of(instrument: InstrumentModel, camera: Camera) -> tuple[tuple[str, 
     )
 
 
-def _unknown(settings: CameraSettings, bins_like_with_like: bool) -> str | None:
+def _phase_problem(settings: CameraSettings, bins_like_with_like: bool) -> str | None:
     if settings.offset_x is None or settings.offset_y is None:
         return "the camera does not report the offset of its region, so the filter of each pixel is unknown"
     if settings.reverse_x or settings.reverse_y:
@@ -79,7 +79,7 @@ def _unknown(settings: CameraSettings, bins_like_with_like: bool) -> str | None:
     return None
 
 
-def _torn(mosaic: tuple[tuple[str, ...], ...], settings: CameraSettings) -> str | None:
+def _size_problem(mosaic: tuple[tuple[str, ...], ...], settings: CameraSettings) -> str | None:
     rows, columns = len(mosaic), len(mosaic[0])
     if (settings.height or 0) % rows or (settings.width or 0) % columns:
         return (
@@ -89,7 +89,7 @@ def _torn(mosaic: tuple[tuple[str, ...], ...], settings: CameraSettings) -> str 
     return None
 
 
-def _named_otherwise(mosaic: tuple[tuple[str, ...], ...], who: CameraIdentity) -> str | None:
+def _name_problem(mosaic: tuple[tuple[str, ...], ...], who: CameraIdentity) -> str | None:
     # Such a format begins with a whole super-pixel wherever its region is.
     if who.analyzers is None or mosaic == who.analyzers:
         return None

@@ -262,7 +262,7 @@ class CaptureRunner:
                 still = {axis: self.rig.axes[axis].read_position() for axis in targets if axis not in moved}
                 exposure.wait_exposed()
             except FrameLost as error:
-                self._again(state, error)
+                self._retake(state, error)
                 return None
         light_s = exposure_s * float(self.table.repeats[state])
         # The camera's own: until it says that the exposure has ended, beyond the exposure itself. The pause between
@@ -293,7 +293,7 @@ class CaptureRunner:
                 frame = exposed.exposure.frame()
                 self.checks.require_as_reported(exposed.state, frame, exposed.settings, self.rig)
             except FrameLost as error:
-                self._again(exposed.state, error)
+                self._retake(exposed.state, error)
                 return
         role, full_scale = self.table.role[exposed.state], self.rig.require_camera().full_scale
         report = self.checks.report(
@@ -369,7 +369,7 @@ class CaptureRunner:
                     f"Home it (acquire home {axis}), then continue with --resume."
                 )
 
-    def _again(self, state: int, error: FrameLost) -> None:
+    def _retake(self, state: int, error: FrameLost) -> None:
         tries = self._retakes.get(state, 0) + 1
         self._retakes[state] = tries
         allowed = self.rig.config.retakes

@@ -84,7 +84,7 @@ def resume(
     job = replace(job, instrument=seen_by_camera(job.instrument, rig.require_camera()))
     lights = sum(role != "dark" for role in job.table.role)
     earlier = on_disc(
-        f"read {partial}", _earlier, partial, frame_shape(rig), job.instrument.mosaic, devices_of(rig), lights=lights
+        f"read {partial}", _history, partial, frame_shape(rig), job.instrument.mosaic, devices_of(rig), lights=lights
     )
     writer = CaptureWriter(on_disc(f"rename {partial}", as_partial, partial), rig.clock)
     pending = [k for k in range(len(job.table)) if k not in earlier.done]
@@ -101,7 +101,7 @@ class Earlier:
     darks: LitDarks
 
 
-def _earlier(
+def _history(
     partial: Path,
     shape: tuple[int, int],
     mosaic: Mosaic | None,

@@ -136,12 +136,12 @@ class StateFile:
             self._put(self._axes[axis]["raw_value"], state, counts)
         for name, value in values.items():
             self._put(self._columns[name], state, value)
-        self._put(self._columns["crc32"], state, state_crc32(sums, self._stored(state)))
+        self._put(self._columns["crc32"], state, state_crc32(sums, self._read_values(state)))
         self.sync()
         self._put(self._columns["done"], state, 1)
         self.sync()
 
-    def _stored(self, state: int) -> dict[str, np.generic]:
+    def _read_values(self, state: int) -> dict[str, np.generic]:
         """Values of a state as the file has them, but for its mark and its checksum."""
         columns = {name: column for name, column in self._columns.items() if name not in ("done", "crc32")}
         columns |= {f"{axis}/{name}": column for axis, pair in self._axes.items() for name, column in pair.items()}

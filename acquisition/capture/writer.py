@@ -148,11 +148,11 @@ class CaptureWriter:
         self._since_s = self._clock.now_s()
         self._state = self._disc.submit(_write_state, self._place, record.state, positions, columns, frame=pixels)
         self._by = threading.get_ident()
-        self._state.add_done_callback(self._written)
+        self._state.add_done_callback(self._on_written)
         if self._state.done():
             self.settle()
 
-    def _written(self, state: Future[None]) -> None:
+    def _on_written(self, state: Future[None]) -> None:
         error = state.exception()
         # A state that has failed already is told of by `put` itself: a future swallows what this raises.
         if error is not None and self.on_failure is not None and threading.get_ident() != self._by:
@@ -179,7 +179,7 @@ class CaptureWriter:
         """Have the open file do something, once the states handed over are on the disc."""
         self.settle()
         try:
-            return self._disc.call(f"write {self.path}", _on_file, self._place, method, *arguments)
+            return self._disc.call(f"write {self.path}", _call_on_file, self._place, method, *arguments)
         except OSError as error:
             raise self._failure(error) from error
 
@@ -220,7 +220,7 @@ class CaptureWriter:
 
     def is_settled(self) -> bool:
         """Wait until every state handed over is on the disc, but for PATIENCE_S at most. Raises AcquisitionError."""
-        return self._settled(PATIENCE_S)
+        return self._wait_for_state(PATIENCE_S)
 
     def settle(self, *, in_haste: bool = False) -> None:
         """Wait until every state handed over is on the disc. Raises AcquisitionError, after DEAD_S at most.
@@ -232,10 +232,10 @@ class CaptureWriter:
         if in_haste:
             self._disc.hurry()
         patience_s = PATIENCE_S if in_haste else DEAD_S
-        if not self._settled(patience_s):
-            raise self._blocked(patience_s)
+        if not self._wait_for_state(patience_s):
+            raise self._blocked_error(patience_s)
 
-    def _settled(self, patience_s: float) -> bool:
+    def _wait_for_state(self, patience_s: float) -> bool:
         if self._state is None:
             return True
         while not wait([self._state], LOOK_S).done:
@@ -257,10 +257,10 @@ class CaptureWriter:
                 self.on_blocked()
             if self._state is not None and not self._state.done() and now_s - self._since_s > DEAD_S:
                 if self.on_failure is not None:
-                    self.on_failure(self._blocked(DEAD_S))
+                    self.on_failure(self._blocked_error(DEAD_S))
                 return
 
-    def _blocked(self, waited_s: float) -> AcquisitionError:
+    def _blocked_error(self, waited_s: float) -> AcquisitionError:
         return AcquisitionError(
             f"{self.path}: the disc has not taken a state for {waited_s:g} s. States done before it are "
             "intact; continue with --resume when the disc works again."
@@ -335,7 +335,7 @@ def _close(path: Path) -> None:
         file.close()
 
 
-def _on_file(path: Path, method: str, *arguments: Any) -> Any:
+def _call_on_file(path: Path, method: str, *arguments: Any) -> Any:
     return getattr(_files[path], method)(*arguments)
 
 

@@ -70,7 +70,7 @@ def home(
     from acquisition.stop_request import StopRequest
 
     config = _load(rig)
-    _known(config, axes or [])
+    _require_axes(config, axes or [])
     with StopRequest(patience=1), open_rig(config, with_camera=False) as live:
         unhomed = live.unhomed()
         names = [name for name in live.homing_order() if name in (axes or unhomed)]
@@ -111,7 +111,7 @@ def move(
     from acquisition.stop_request import StopRequest
 
     config = _load(rig)
-    _known(config, [axis])
+    _require_axes(config, [axis])
     with (
         StopRequest(patience=1),
         open_rig(config, with_camera=False) as live,
@@ -184,7 +184,7 @@ def _say_ended(config: RigConfig) -> None:
         typer.echo("the emulators of this rig end with this command: the next one finds them as they were at first")
 
 
-def _known(config: RigConfig, names: list[str]) -> list[str]:
+def _require_axes(config: RigConfig, names: list[str]) -> list[str]:
     from processing.yaml_file import ConfigError
 
     for name in names:

@@ -55,13 +55,13 @@ def _capture(path: Path) -> Finding:
     return Finding(path.name, True if status == "complete" and not path.name.endswith(PARTIAL) else None, text)
 
 
-def _planned(folder: Path) -> list[CampaignCapture]:
+def _load_captures(folder: Path) -> list[CampaignCapture]:
     return list(captures(load_yaml(folder / PLAN, Campaign)))
 
 
 def _index(folder: Path) -> Iterator[Finding]:
     try:
-        planned = _planned(folder)
+        planned = _load_captures(folder)
     except ProcessError as error:
         yield Finding(PLAN, False, str(error))
         return
@@ -105,9 +105,9 @@ def repair(folder: Path) -> Iterator[Finding]:
                 path.unlink()
                 yield Finding(path.name, True, "removed")
             elif _is_capture(path):
-                yield _mended(path)
+                yield _repair_capture(path)
         if held is not None:
-            yield from _rebuilt(held)
+            yield from _rebuild_index(held)
     finally:
         if held is not None:
             held.close()
@@ -127,7 +127,7 @@ def compressed(folder: Path) -> Iterator[Finding]:
         yield Finding(path.name, True, detail)
 
 
-def _mended(path: Path) -> Finding:
+def _repair_capture(path: Path) -> Finding:
     try:
         with Capture(path, verify=False) as capture:
             damaged, summed = capture.damaged_states(), capture.checked
@@ -144,8 +144,8 @@ def _mended(path: Path) -> Finding:
     return Finding(path.name, True, f"sealed as {final.name}")
 
 
-def _rebuilt(held: CampaignFolder) -> Iterator[Finding]:
-    for capture in _planned(held.folder):
+def _rebuild_index(held: CampaignFolder) -> Iterator[Finding]:
+    for capture in _load_captures(held.folder):
         path = held.folder / capture.name
         try:
             if path.exists():

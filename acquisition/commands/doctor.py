@@ -165,7 +165,7 @@ def _camera(camera: Camera, config: RigConfig, frames: int) -> str:
         + "".join(f"; NOT IN A KNOWN STATE: {text}" for text in camera.warnings())
     )
     if lost:
-        raise AcquisitionError(report + ". " + _against_loss(who))
+        raise AcquisitionError(report + ". " + _loss_advice(who))
     if config.detector.bits is not None and camera.bits != config.detector.bits:
         raise AcquisitionError(
             f"{report}. The rig file says {config.detector.bits} bits under `detector`; correct that or `camera`"
@@ -173,7 +173,7 @@ def _camera(camera: Camera, config: RigConfig, frames: int) -> str:
     return report
 
 
-def _against_loss(who: CameraIdentity) -> str:
+def _loss_advice(who: CameraIdentity) -> str:
     """What to change, with the numbers that are set now."""
     if who.packet_size is None:
         return "Check the cable, and that nothing else loads the USB controller."

@@ -80,7 +80,7 @@ def _run(options: Options, stop: StopRequest) -> int:
     console = Console(stderr=True)
     if (
         options.resume is not None
-        and (sealed := on_disc(f"look at {options.resume}", _sealed, options.resume)) is not None
+        and (sealed := on_disc(f"look at {options.resume}", _seal_if_whole, options.resume)) is not None
     ):
         typer.echo(f"all states were complete; sealed as {sealed}")
         return 0
@@ -167,7 +167,7 @@ def given_rig(file: Path) -> RigConfig:
     return rig
 
 
-def _sealed(path: Path) -> Path | None:
+def _seal_if_whole(path: Path) -> Path | None:
     wait_until_free(path)
     return seal_whole(path) if path.name.endswith(PARTIAL) and path.exists() else None
 
@@ -248,7 +248,7 @@ def show_checks(console: Console, checks: tuple[CheckResult, ...]) -> None:
 def summarize(job: Job, result: Result) -> None:
     """Draw the quick look and print one screen."""
     try:
-        figure = str(on_disc("draw the quick look", _drawn, result.path))
+        figure = str(on_disc("draw the quick look", _draw_quicklook, result.path))
     except (OSError, AcquisitionError) as error:
         # The capture is whole: a picture less is no reason to call it failed.
         figure = f"not drawn ({getattr(error, 'strerror', None) or error}); the capture is whole"
@@ -271,7 +271,7 @@ def summarize(job: Job, result: Result) -> None:
         typer.echo(f"{label:<11} {text}")
 
 
-def _drawn(path: Path) -> Path:
+def _draw_quicklook(path: Path) -> Path:
     from acquisition.screen import quicklook
 
     return quicklook.draw(path)

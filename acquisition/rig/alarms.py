@@ -31,7 +31,7 @@ def folder() -> Path:
     return Path(tempfile.gettempdir()) / f"umov-{os.getuid()}"
 
 
-def _made() -> Path:
+def _make_folder() -> Path:
     """The folder, made if it is not there. Raises OSError where another user has made it first."""
     path = folder()
     path.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -48,7 +48,7 @@ def _is_own(path: Path) -> bool:
 
 def give_alarm(rig: str, text: str) -> Path:
     """Write an alarm down, or replace the one of this process; it is over when the file is gone. Raises OSError."""
-    path = _made() / f"alarm-{os.getpid()}.json"
+    path = _make_folder() / f"alarm-{os.getpid()}.json"
     now = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
     new = path.with_suffix(".new")
     new.write_text(json.dumps({"rig": rig, "time": now, "text": text}), encoding="utf-8")
@@ -59,7 +59,7 @@ def give_alarm(rig: str, text: str) -> Path:
 def keep(what: str, name: str, text: str) -> str:
     """Write a text to a file in memory; returns a sentence that says where."""
     try:
-        path = _made() / name
+        path = _make_folder() / name
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         return f"The {what} could not be kept ({error})."

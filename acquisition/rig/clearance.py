@@ -130,7 +130,7 @@ def gap_mm(a: Footprint, b: Footprint) -> float:
     """Horizontal distance of two footprints, 0 where they overlap."""
     if _overlap(a.corners_mm, b.corners_mm):
         return 0.0
-    nearest = min(_to_edges(a.corners_mm, b.corners_mm), _to_edges(b.corners_mm, a.corners_mm))
+    nearest = min(_distance_to_edges(a.corners_mm, b.corners_mm), _distance_to_edges(b.corners_mm, a.corners_mm))
     return max(0.0, nearest - a.radius_mm - b.radius_mm)
 
 
@@ -146,7 +146,7 @@ def _overlap(p: NDArray[np.float64], q: NDArray[np.float64]) -> bool:
     return bool(polygons)
 
 
-def _to_edges(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> float:
+def _distance_to_edges(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> float:
     """Smallest distance of any of the points from any edge of the polygon, or from its one point."""
     edge = np.roll(polygon, -1, axis=0) - polygon
     to_point = points[:, np.newaxis] - polygon

@@ -30,7 +30,7 @@ class RigConfig(RigSections):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _all_mistakes_at_once(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def _report_all_mistakes(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         # What one section says about another is looked at even where a section cannot be read at all.
         wrong: list[Mistake] = []
         rig: RigConfig

@@ -18,11 +18,11 @@ def folded(table: StateTable, rig: Rig) -> StateTable:
     angles = dict(table.angles_deg)
     for name, period_deg in rig.config.fold_deg.items():
         if name in angles:
-            angles[name] = _into(angles[name], rig.axes[name].limits, float(period_deg))
+            angles[name] = _fold_column(angles[name], rig.axes[name].limits, float(period_deg))
     return replace(table, angles_deg=angles)
 
 
-def _into(column: np.ndarray, limits: Limits, period_deg: float) -> np.ndarray:
+def _fold_column(column: np.ndarray, limits: Limits, period_deg: float) -> np.ndarray:
     low = -math.inf if limits.min_deg is None else limits.min_deg
     high = math.inf if limits.max_deg is None else limits.max_deg
     if np.all((low <= column) & (column <= high)):

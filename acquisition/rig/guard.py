@@ -96,7 +96,7 @@ class Guard:
             silent_s = 0.0 if heard else silent_s + min(now_s - before_s, LATE_S)
             before_s = now_s
             if heard:
-                data = _received(line)
+                data = _receive(line)
                 if not data:
                     return self._act("acquire died", beat)
                 self._has_shut = False
@@ -298,7 +298,7 @@ def _print(text: str) -> None:
     threading.Thread(target=write, daemon=True).start()
 
 
-def _received(line: socket.socket) -> bytes:
+def _receive(line: socket.socket) -> bytes:
     try:
         return line.recv(1 << 16)
     except OSError:

@@ -171,9 +171,9 @@ class Guarding:
         ours.sendall(json.dumps(hello).encode() + b"\n")
         end_s = time.monotonic() + START_S
         while time.monotonic() < end_s and not self._ended.is_set():
-            messages = self._heard(LOOK_S)
+            messages = self._receive(LOOK_S)
             if messages is None:
-                return self._how_it_ended()
+                return self._describe_end()
             if any("watching" in message for message in messages):
                 self._watching.set()
                 return ""
@@ -188,10 +188,10 @@ class Guarding:
             if now_s - beat_s >= BEAT_S:
                 number, beat_s = number + 1, now_s
                 self._say({"beat": number})
-            messages = self._heard(LOOK_S)
+            messages = self._receive(LOOK_S)
             now_s = time.monotonic()
             if messages is None:
-                return self._how_it_ended()
+                return self._describe_end()
             silent_s = 0.0 if messages else silent_s + min(now_s - before_s, LATE_S)
             before_s = now_s
             for message in messages:
@@ -228,7 +228,7 @@ class Guarding:
         self._is_dark_due = False
         return None
 
-    def _heard(self, wait_s: float) -> list[dict[str, object]] | None:
+    def _receive(self, wait_s: float) -> list[dict[str, object]] | None:
         """What the guard said in this time; None where it has ended."""
         assert self._line is not None
         if not select.select([self._line], [], [], wait_s)[0]:
@@ -247,7 +247,7 @@ class Guarding:
             if self._line is not None:
                 self._line.send(json.dumps(message).encode() + b"\n", socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
 
-    def _how_it_ended(self) -> str:
+    def _describe_end(self) -> str:
         guard = self._guard
         if guard is None:
             return "it did not begin"

@@ -111,15 +111,15 @@ class JointAxes:
         return motions
 
     def _check_way(self, targets_deg: Mapping[str, float]) -> None:
-        obstacle = self._met(targets_deg)
+        obstacle = self._find_obstacle(targets_deg)
         if obstacle is not None:
             raise AcquisitionError(f"move to {dict(targets_deg)} meets {obstacle}. Nothing was moved.")
 
     def is_free(self, targets_deg: Mapping[str, float]) -> bool:
         """Whether the axes can move there straight away."""
-        return self._met(targets_deg) is None
+        return self._find_obstacle(targets_deg) is None
 
-    def _met(self, targets_deg: Mapping[str, float]) -> str | None:
+    def _find_obstacle(self, targets_deg: Mapping[str, float]) -> str | None:
         if not concerned(self.config) & targets_deg.keys():
             # Not even a position is read then: most moves are of rotators that nothing can hit.
             return None

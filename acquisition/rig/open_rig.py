@@ -100,14 +100,14 @@ class EmulatedRig(Rig):
         self._camera_entry = self.config.camera.model_copy(update={"device": self.simulation.camera_device()})
         return super().open_camera()
 
-    def _at_port(self, entry: Any) -> Any:
+    def _resolve_port(self, entry: Any) -> Any:
         # What is switched by hand has no port.
         if not getattr(entry, "port", "").startswith(SCHEME):
             return entry
         changes = {"port": self.simulation.port(entry.port.removeprefix(SCHEME))}
         # A filter wheel's shutter has a port of its own.
         if getattr(entry, "shutter", None) is not None:
-            changes["shutter"] = self._at_port(entry.shutter)
+            changes["shutter"] = self._resolve_port(entry.shutter)
         return entry.model_copy(update=changes)
 
     def show(

@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 
 
 @contextmanager
-def _said_of(device: str) -> Iterator[None]:
+def _errors_of(device: str) -> Iterator[None]:
     """Errors of opening a port name the port; a person looks for the device that the rig file names."""
     try:
         yield
@@ -115,10 +115,10 @@ class Rig(JointAxes):
     def _open(self) -> None:
         self.start()
         for name in self.config.axes:
-            with _said_of(f"axis {name}"):
+            with _errors_of(f"axis {name}"):
                 self.open_axis(name)
         if self.config.source is not None:
-            with _said_of("source"):
+            with _errors_of("source"):
                 self.open_source()
         if self._with_camera:
             self.open_camera()
@@ -152,14 +152,14 @@ class Rig(JointAxes):
 
     def open_axis(self, name: str) -> MotionAxis:
         """Open one axis of the rig file; moves nothing."""
-        self.axes[name] = open_axis(name, self._at_port(self.config.axes[name]), self._lines)
+        self.axes[name] = open_axis(name, self._resolve_port(self.config.axes[name]), self._lines)
         return self.axes[name]
 
     def open_source(self) -> WatchedSource:
         """Open the light source; changes no light."""
         if self.config.source is None:
             raise AcquisitionError(f"rig {self.config.name!r} has no source")
-        entry = self._at_port(self.config.source)
+        entry = self._resolve_port(self.config.source)
         source = open_source(entry, self._lines)
         if isinstance(source, ManualSource):
             source.ask = self._ask
@@ -172,7 +172,7 @@ class Rig(JointAxes):
         self.camera = camera
         return camera
 
-    def _at_port(self, entry: Any) -> Any:
+    def _resolve_port(self, entry: Any) -> Any:
         """The entry of a device, with the port that it has now."""
         return entry
 

@@ -138,7 +138,7 @@ def find_homing_obstacle(rig: RigSections, names: Iterable[str], here_deg: Mappi
     for name in names:
         path = rig.homing.get(name)
         ways = ranges | {name: path.passes_deg if path else ANYWHERE}
-        obstacle = _met_homing(rig, name, ways)
+        obstacle = _homing_obstacle(rig, name, ways)
         if obstacle is not None:
             hint = "" if path else f". If it cannot get there, say which angles it passes, in `homing: {{{name}: ...}}`"
             return f"homing {name} may meet {obstacle}{hint}"
@@ -149,7 +149,7 @@ def find_homing_obstacle(rig: RigSections, names: Iterable[str], here_deg: Mappi
     return None
 
 
-def _met_homing(rig: RigSections, name: str, ways: Mapping[str, tuple[float, float]]) -> str | None:
+def _homing_obstacle(rig: RigSections, name: str, ways: Mapping[str, tuple[float, float]]) -> str | None:
     for box in rig.forbidden:
         if name in box.ranges_deg and not box.homing_may_pass and touches(box, ways):
             return forbidden_poses.describe(box)

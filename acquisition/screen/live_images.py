@@ -22,7 +22,7 @@ def last_frame_png(pixels: NDArray[np.uint16], black: float, full_scale: int) ->
         return png(grey)
     image = np.repeat(grey[..., np.newaxis], 3, axis=2)
     # A saturated pixel must show even where thinning left it out.
-    image[_thin_largest(pixels)[: image.shape[0], : image.shape[1]] >= full_scale] = (255, 40, 40)
+    image[_block_maximum(pixels)[: image.shape[0], : image.shape[1]] >= full_scale] = (255, 40, 40)
     return png(image)
 
 
@@ -94,7 +94,7 @@ def thinned(pixels: NDArray[np.uint16]) -> NDArray[np.uint16]:
     return pixels[::step, ::step]
 
 
-def _thin_largest(pixels: NDArray[np.uint16]) -> NDArray[np.uint16]:
+def _block_maximum(pixels: NDArray[np.uint16]) -> NDArray[np.uint16]:
     step = _step(pixels)
     rows, columns = -(-pixels.shape[0] // step) * step, -(-pixels.shape[1] // step) * step
     padded = np.zeros((rows, columns), dtype=pixels.dtype)

@@ -73,7 +73,7 @@ class Shown:
         quick = "modulation" if view.pop("mosaic", None) is None else "DoLP"
         view |= {"simulated": self._simulated, "quick": quick, "full_scale": self._full_scale}
         if frame is not None:
-            view["histogram"] = self._once("histogram", lambda: histogram(frame, self._full_scale))
+            view["histogram"] = self._draw_once("histogram", lambda: histogram(frame, self._full_scale))
         return view
 
     def picture(self, name: str) -> bytes | None:
@@ -83,15 +83,15 @@ class Shown:
         if frame is None:
             return None
         if name == "frame.png":
-            return self._once(name, lambda: last_frame_png(frame, self._black, self._full_scale))
+            return self._draw_once(name, lambda: last_frame_png(frame, self._black, self._full_scale))
         mosaic = view.get("mosaic")
         if mosaic is None:
-            return self._once(name, modulation)
+            return self._draw_once(name, modulation)
         if view["role"] == "dark":
             return None
-        return self._once(name, lambda: dolp_png(frame, mosaic, self._black))
+        return self._draw_once(name, lambda: dolp_png(frame, mosaic, self._black))
 
-    def _once(self, name: str, draw: Callable[[], Drawn]) -> Drawn:
+    def _draw_once(self, name: str, draw: Callable[[], Drawn]) -> Drawn:
         # Under the lock of its own pictures: a second browser waits for the first one's instead of drawing again.
         drawn = self._drawn
         with self._drawing:

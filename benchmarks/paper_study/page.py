@@ -37,7 +37,7 @@ def write_page(
 ) -> None:
     """Write the HTML file."""
     wavelengths = sorted({row.wavelength_nm for row in sphere.as_told.rows})
-    shown = {nm: _shown(sphere.folder, nm) for nm in wavelengths}
+    shown = {nm: _shown_product(sphere.folder, nm) for nm in wavelengths}
     dominant = {nm: figures.dominant(path, SPHERE, TABLE_I) for nm, path in shown.items()}
     of_body = {nm: figures.dominant(products.mueller, BODY, TABLE_I) for nm, products in body.items()}
     sections = [
@@ -196,13 +196,13 @@ def _fault(fault: FaultStudy, wavelengths: Sequence[float]) -> ReportSection:
         rows.append([f"{key[0]:g} nm", f"{key[1]:g}", *cells])
     nm = wavelengths[-1]
     folders = [next(iter(result.tables.values())).parent for result in (fault.before, fault.after)]
-    images = [figures.dominant(_shown(folder, nm), SPHERE, TABLE_I) for folder in folders]
+    images = [figures.dominant(_shown_product(folder, nm), SPHERE, TABLE_I) for folder in folders]
     shown = [figures.fault_images(images[0], images[1], nm)]
     tables = [("Before and after, in the paper's figures of merit", rows)]
     return _section("An undeclared fault, found", shown, tables, summary)
 
 
-def _shown(folder: Path, nm: float) -> Path:
+def _shown_product(folder: Path, nm: float) -> Path:
     """The Mueller product of a folder at the wavelength and the angle that the paper shows."""
     for path in sorted(folder.glob("*.mueller.h5")):
         with Product(path) as product:

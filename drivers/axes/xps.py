@@ -217,12 +217,12 @@ class XPSAxis(MotionAxis):
 
     def _do_is_homed(self) -> bool:
         # One garbled digit must not make a reference.
-        return all(s in READY or s in DISABLED or (s in MOVING and s != HOMING) for s in self._twice())
+        return all(s in READY or s in DISABLED or (s in MOVING and s != HOMING) for s in self._read_status_twice())
 
     def _do_is_moving(self) -> bool:
-        return any(status in MOVING for status in self._twice())
+        return any(status in MOVING for status in self._read_status_twice())
 
-    def _twice(self) -> tuple[int, int]:
+    def _read_status_twice(self) -> tuple[int, int]:
         return self._status(), self._status()
 
     def _start(self, call: str) -> None:

@@ -139,12 +139,12 @@ class Dc4100(PortSource):
             self.set_light(False)
             self._tell(f"M {BRIGHTNESS_MODE}")
             if self._digit("M?", "012") != BRIGHTNESS_MODE:
-                raise self._refused(request, "it does not change to brightness mode")
+                raise self._rejection(request, "it does not change to brightness mode")
         self._tell(f"BP {self._selected} {percent:g}")
         reading = self._number(f"BP? {self._selected}")
         # The box may round to whole percents.
         if abs(reading - percent) > 0.5:
-            raise self._refused(request, f"it reads back {reading:g} %")
+            raise self._rejection(request, f"it reads back {reading:g} %")
         return reading
 
     def describe(self) -> dict[str, str]:
@@ -183,7 +183,7 @@ class Dc4100(PortSource):
         # Sent once: what became of it is read and not assumed.
         self._tell(f"O {channel} {int(on)}")
         if self._output(channel) != on:
-            raise self._refused(request, "its output did not follow", channel)
+            raise self._rejection(request, "its output did not follow", channel)
 
     def _output(self, channel: int) -> bool:
         return self._digit(f"O? {channel}", "01") == 1
@@ -191,7 +191,7 @@ class Dc4100(PortSource):
     def _status(self) -> int:
         return int(self._number("R?"))
 
-    def _refused(self, asked: str, came_back: str, channel: int | None = None) -> CommandRejected:
+    def _rejection(self, asked: str, came_back: str, channel: int | None = None) -> CommandRejected:
         status = self._status()
         reasons = {SUPPLY_FAILS: "its supply is out of range", TOO_HOT: "it is too hot and has shut off all LEDs"}
         if channel is not None:
@@ -212,7 +212,7 @@ class Dc4100(PortSource):
             if answers[-1] == answers[-2] and answers[-1] in allowed and answers[-1]:
                 return int(answers[-1])
             self._link.purge()
-        raise self._garbled(query, " ".join(answers))
+        raise self._reply_error(query, " ".join(answers))
 
     def _number(self, query: str) -> float:
         return float(agreed(lambda: self._ask(query, _NUMBER)))
@@ -232,7 +232,7 @@ class Dc4100(PortSource):
         with self._link.lock:
             self._link.write(command.encode("ascii") + b"\r\n")
 
-    def _garbled(self, query: str, answer: str) -> ReplyError:
+    def _reply_error(self, query: str, answer: str) -> ReplyError:
         return ReplyError(
             f"LED driver on {self.config.port}, {query}", f"no sense in {answer!r}", "Check cable and grounding"
         )

@@ -69,7 +69,7 @@ class RelayModule(PortSource):
         try:
             return bool(int(reply[:2], 16) >> self.config.output & 1)
         except ValueError:
-            raise self._disturbed("read the outputs", reply) from None
+            raise self._reply_error("read the outputs", reply) from None
 
     def _ask(self, lead: str, command: str, *, addressed: bool = True) -> str:
         """What a reply ``!AA...`` holds; an unusable reply is asked for once more."""
@@ -79,7 +79,7 @@ class RelayModule(PortSource):
                 reply = self._exchange(lead, command)
                 if reply.startswith(start):
                     return reply.removeprefix(start)
-                raise self._disturbed(f"{lead}{command}", reply)
+                raise self._reply_error(f"{lead}{command}", reply)
             except (ReplyError, ReplyTimeout):
                 if last:
                     raise
@@ -95,7 +95,7 @@ class RelayModule(PortSource):
             raise ReplyTimeout(request, f"no reply in {self.config.reply_s:g} s", "Check power, cable and address")
         return frame.decode("ascii", "replace").strip()
 
-    def _disturbed(self, asked: str, reply: str) -> ReplyError:
+    def _reply_error(self, asked: str, reply: str) -> ReplyError:
         return ReplyError(f"{self._name}, {asked}", f"{reply!r}", "The line is disturbed: check cable and baud rate")
 
 

@@ -38,7 +38,7 @@ def fit_of_the_truth(
     problem = InstrumentProblem(model.at(data[0].wavelength_nm), data)
     numbers = {path.stem: k for k, path in enumerate(captures)}
     keys = {(f.kind, f.place, numbers.get(f.capture) if f.capture else None) for f in faults}
-    space = Space(tuple(_as_drawn(c) for c in problem.pool() if (c.kind, c.place, c.capture) in keys))
+    space = Space(tuple(_set_prior_width(c) for c in problem.pool() if (c.kind, c.place, c.capture) in keys))
     if not space.size:
         return None
     fit = minimize(problem, space, np.zeros(space.size))
@@ -64,7 +64,7 @@ def known_oracle(folder: Path, truth: RealBench, configs: Path, given: str) -> f
     return error
 
 
-def _as_drawn(candidate: Candidate) -> Candidate:
+def _set_prior_width(candidate: Candidate) -> Candidate:
     width = PRIORS[candidate.kind].rms / PRIOR_WIDTH
     return replace(candidate, parameters=tuple(replace(p, typical=width) for p in candidate.parameters))
 

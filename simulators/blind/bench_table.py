@@ -57,7 +57,7 @@ def _share(values: Sequence[bool]) -> str:
     return f"{100 * float(np.mean(values)):.1f} % of {len(values)}" if values else "none"
 
 
-def _by(certainty: str, judgements: Sequence[BenchJudgement], right: Callable[[TrueCause], bool]) -> str:
+def _share_right(certainty: str, judgements: Sequence[BenchJudgement], right: Callable[[TrueCause], bool]) -> str:
     return _share([right(c) for j in judgements for c in j.causes if c.certainty == certainty])
 
 
@@ -101,9 +101,9 @@ def _matrix_lines(judgements: Sequence[BenchJudgement]) -> list[str]:
 def _name_lines(judgements: Sequence[BenchJudgement]) -> list[str]:
     outcomes = [m.told for j in judgements for m in j.matters if m.size > MATTERS]
     lines = [
-        f"called sure, and right: {_by('sure', judgements, lambda c: c.right)} (goal 99 %)",
-        f"called likely, and right: {_by('likely', judgements, lambda c: c.right)}",
-        f"called one of a set, and right: {_by('one_of', judgements, lambda c: c.right_set)}",
+        f"called sure, and right: {_share_right('sure', judgements, lambda c: c.right)} (goal 99 %)",
+        f"called likely, and right: {_share_right('likely', judgements, lambda c: c.right)}",
+        f"called one of a set, and right: {_share_right('one_of', judgements, lambda c: c.right_set)}",
         f"benches without a sure wrong name: {_share([not sure_and_wrong(j) for j in judgements])}",
         f"faults that matter: named {_share([t == 'named' for t in outcomes])}, "
         f"named or in a named set {_share([t != 'missed' for t in outcomes])} (goal 80 %)",

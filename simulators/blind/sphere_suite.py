@@ -58,10 +58,10 @@ def drawn(kind: str, random: np.random.Generator, scene: Scene, instrument: Inst
         return nothing
     if kind == "two":
         first, second = sorted(random.choice(len(LISTED), 2, replace=False))
-        pair = _with(LISTED[second], random, _with(LISTED[first], random, nothing))
+        pair = _add_fault(LISTED[second], random, _add_fault(LISTED[first], random, nothing))
         return replace(pair, kind=f"{LISTED[first]}+{LISTED[second]}")
     if kind in LISTED:
-        return replace(_with(kind, random, nothing), kind=kind)
+        return replace(_add_fault(kind, random, nothing), kind=kind)
     return replace(nothing, kind=kind, scene=_unlisted_scene(kind, random, scene))
 
 
@@ -71,21 +71,21 @@ def first_surface_of(material: Any) -> first_surface.Model:
     return first_surface.Model(name="first surface alone", constants=plain)
 
 
-def _with(kind: str, random: np.random.Generator, so_far: SphereFault) -> SphereFault:
+def _add_fault(kind: str, random: np.random.Generator, so_far: SphereFault) -> SphereFault:
     scene, instrument, truth = so_far.scene, so_far.instrument, dict[str, float]()
     if kind == "arm_zero":
         truth = {"arm": _signed(random, 0.7, 4.0)}
-        return _added(so_far, kind, truth, scene=scene_faults.ArmZeroFault(scene, truth["arm"]))
+        return _extend(so_far, kind, truth, scene=scene_faults.ArmZeroFault(scene, truth["arm"]))
     if kind in ("illumination_azimuth", "analyzer_roll"):
         turn = scene_faults.turned_generator if kind == "illumination_azimuth" else scene_faults.turned_analyzer
         truth = {"azimuth": _signed(random, 0.4, 5.0)}
-        return _added(so_far, kind, truth, instrument=turn(instrument, truth["azimuth"]))
+        return _extend(so_far, kind, truth, instrument=turn(instrument, truth["azimuth"]))
     if not isinstance(scene, Scene):
         raise ValueError(f"{kind} has to be put in before what stands in front of the scene")
     if kind == "registration":
         truth = {n: random.uniform(-s, s) for n, s in (("x", 0.8), ("y", 0.8), ("scale", 0.03))}
         moved = scene_faults.moved_sphere(scene, truth["x"], truth["y"], truth["scale"])
-        return _added(so_far, kind, truth, scene=moved)
+        return _extend(so_far, kind, truth, scene=moved)
     if kind == "interreflection":
         towards, uneven = random.uniform(0, 2 * math.pi), random.uniform(0, 0.6)
         support = scene_faults.LitSupport(
@@ -95,7 +95,7 @@ def _with(kind: str, random: np.random.Generator, so_far: SphereFault) -> Sphere
             below_mm=random.uniform(22, 45),
             uneven=(uneven * math.cos(towards), uneven * math.sin(towards)),
         )
-        return _added(so_far, kind, {}, scene=support)
+        return _extend(so_far, kind, {}, scene=support)
     if kind == "polarized_diffuse":
         a, b = float(np.exp(random.uniform(np.log(0.02), np.log(0.3)))), random.uniform(1.5, 3.0)
         constants = so_far.material.constants
@@ -103,18 +103,18 @@ def _with(kind: str, random: np.random.Generator, so_far: SphereFault) -> Sphere
         believed = first_surface_of(so_far.material)
         surface = Scene(scene.spec, so_far.material.model_copy(update={"constants": true}))
         # Without a diffuse term the model's exponent stands at 2.
-        return _added(so_far, kind, {"a": a, "log_b": float(np.log(b / 2))}, scene=surface, material=believed)
+        return _extend(so_far, kind, {"a": a, "log_b": float(np.log(b / 2))}, scene=surface, material=believed)
     if kind == "refractive_index":
         truth = {"n": random.uniform(-0.2, 0.2), "k": random.uniform(-0.06, 0.07)}
         wrong = {
             nm: c.model_copy(update={"n": c.n - truth["n"], "k": c.k - truth["k"]})
             for nm, c in so_far.material.constants.items()
         }
-        return _added(so_far, kind, truth, material=so_far.material.model_copy(update={"constants": wrong}))
+        return _extend(so_far, kind, truth, material=so_far.material.model_copy(update={"constants": wrong}))
     raise ValueError(f"no fault {kind!r}; there are none, two, {', '.join((*LISTED, *UNLISTED))}")
 
 
-def _added(so_far: SphereFault, kind: str, truth: dict[str, float], **changed: Any) -> SphereFault:
+def _extend(so_far: SphereFault, kind: str, truth: dict[str, float], **changed: Any) -> SphereFault:
     return replace(so_far, parameters={**so_far.parameters, kind: truth}, **changed)
 
 

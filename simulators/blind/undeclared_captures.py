@@ -210,7 +210,7 @@ def expose(bench: TrueBench, scene: TrueScene, angles_deg: dict[str, Array]) -> 
                 m = _turned(scene, bench, xs - dx, ys - dy, angle=sum(t(k) for t in bench.turned))
         g, a = bench.generated(angles, k), bench.analyzed(angles, k)
         light = np.einsum("ci,hwij,...j->chw", a, m, g) if g.ndim == 1 else np.einsum("ci,hwij,hwj->chw", a, m, g)
-        out[k] = _on_mosaic(light) if bench.mosaic else light[0]
+        out[k] = _sample_mosaic(light) if bench.mosaic else light[0]
         for factor in bench.level:
             out[k] *= factor(k, angles)
         # What would pass without any polarization: a quarter of m00, whatever the state.
@@ -237,7 +237,7 @@ def _turned(scene: TrueScene, bench: TrueBench, xs: Array, ys: Array, *, angle: 
     return np.asarray(r @ back @ r.T)
 
 
-def _on_mosaic(light: Array) -> Array:
+def _sample_mosaic(light: Array) -> Array:
     # 90 45 / 135 0 from the top left; channels come as 0, 45, 90, 135.
     out = np.empty(light.shape[1:])
     for (r, c), k in {(0, 0): 2, (0, 1): 1, (1, 0): 3, (1, 1): 0}.items():

@@ -15,7 +15,7 @@ from simulators.blind.undeclared_faults import Fault, Truth
 Angles = dict[str, Array]
 
 
-def _recorded(name: str, change: Callable[[Angles], Angles]) -> Fault:
+def _angle_fault(name: str, change: Callable[[Angles], Angles]) -> Fault:
     """The angles in the capture file are not those of the bench."""
 
     def fault(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
@@ -25,7 +25,7 @@ def _recorded(name: str, change: Callable[[Angles], Angles]) -> Fault:
     return fault
 
 
-def _stored(name: str, change: Callable[[Array], Array]) -> Fault:
+def _frame_fault(name: str, change: Callable[[Array], Array]) -> Fault:
     """The frames in the capture file are not as the camera took them."""
 
     def fault(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
@@ -55,23 +55,23 @@ def wavelength(bench: TrueBench, random: np.random.Generator, states: int) -> Tr
 
 
 WIRING: dict[str, Fault] = {
-    "psg_reversed": _recorded("psg_reversed", lambda a: a | {"psg": -a["psg"]}),
-    "psa_reversed": _recorded("psa_reversed", lambda a: a | {"psa": -a["psa"]}),
-    "both_reversed": _recorded("both_reversed", lambda a: {name: -v for name, v in a.items()}),
-    "axes_swapped": _recorded("axes_swapped", lambda a: a | {"psg": a["psa"], "psa": a["psg"]}),
-    "ratio": _recorded("ratio", lambda a: a | {"psa": 5.0 * a["psg"]}),
+    "psg_reversed": _angle_fault("psg_reversed", lambda a: a | {"psg": -a["psg"]}),
+    "psa_reversed": _angle_fault("psa_reversed", lambda a: a | {"psa": -a["psa"]}),
+    "both_reversed": _angle_fault("both_reversed", lambda a: {name: -v for name, v in a.items()}),
+    "axes_swapped": _angle_fault("axes_swapped", lambda a: a | {"psg": a["psa"], "psa": a["psg"]}),
+    "ratio": _angle_fault("ratio", lambda a: a | {"psa": 5.0 * a["psg"]}),
     "psg_zero": _zero("psg_zero", "og", (20.0, -20.0, 45.0, 90.0)),
     "psa_zero": _zero("psa_zero", "oa", (20.0, -20.0, 45.0, 90.0)),
     "analyzer_zero": _zero("analyzer_zero", "lp", (20.0, -20.0, 45.0, 90.0)),
-    "frame_order": _recorded("frame_order", lambda a: {name: v[::-1].copy() for name, v in a.items()}),
-    "off_by_one": _recorded("off_by_one", lambda a: {name: np.roll(v, 1) for name, v in a.items()}),
-    "half_degrees": _recorded("half_degrees", lambda a: {name: v / 2 for name, v in a.items()}),
-    "double_degrees": _recorded("double_degrees", lambda a: {name: 2 * v for name, v in a.items()}),
+    "frame_order": _angle_fault("frame_order", lambda a: {name: v[::-1].copy() for name, v in a.items()}),
+    "off_by_one": _angle_fault("off_by_one", lambda a: {name: np.roll(v, 1) for name, v in a.items()}),
+    "half_degrees": _angle_fault("half_degrees", lambda a: {name: v / 2 for name, v in a.items()}),
+    "double_degrees": _angle_fault("double_degrees", lambda a: {name: 2 * v for name, v in a.items()}),
     "wavelength": wavelength,
 }
 #: Of a polarization camera: what moves its super-pixels against the declared layout.
 MOSAIC_WIRING: dict[str, Fault] = {
-    "mirrored_image": _stored("mirrored_image", lambda c: c[..., ::-1]),
-    "rotated_image": _stored("rotated_image", lambda c: c[:, ::-1, ::-1]),
-    "mosaic_order": _stored("mosaic_order", lambda c: c[:, ::-1]),
+    "mirrored_image": _frame_fault("mirrored_image", lambda c: c[..., ::-1]),
+    "rotated_image": _frame_fault("rotated_image", lambda c: c[:, ::-1, ::-1]),
+    "mosaic_order": _frame_fault("mosaic_order", lambda c: c[:, ::-1]),
 }

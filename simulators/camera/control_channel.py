@@ -98,7 +98,7 @@ class ControlChannel:
         while self._socket is channel:
             # What waits was sent while this thread had no turn: its sender was not silent.
             if not select.select([channel], [], [], 0)[0]:
-                self._let_go_of_the_silent()
+                self._release_silent_controller()
             for heard in select.select(self._heard, [], [], _SLICE_S)[0]:
                 # The port of somebody who is gone; the next packet is another's. A packet that is too short for what it
                 # says is nobody's command.
@@ -107,7 +107,7 @@ class ControlChannel:
                     if heard is channel or packet[2:4] == struct.pack(">H", _DISCOVERY):
                         self._answer(channel, packet, sender)
 
-    def _let_go_of_the_silent(self) -> None:
+    def _release_silent_controller(self) -> None:
         (allowed_ms,) = struct.unpack(">I", self._device.read(HEARTBEAT_MS, 4))
         if self._controller is not None and time.monotonic() - self._heard_s > allowed_ms * 1e-3:
             self._release()

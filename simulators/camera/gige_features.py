@@ -179,8 +179,8 @@ def _region(table: NodeMap, width: int, height: int) -> list[str]:
     features = [
         _integer("SensorWidth", SENSOR_WIDTH, 1, width, access="RO"),
         _integer("SensorHeight", SENSOR_HEIGHT, 1, height, access="RO"),
-        _most("WidthMax", width, "X", angles=angles),
-        _most("HeightMax", height, "Y", angles=angles),
+        _maximum("WidthMax", width, "X", angles=angles),
+        _maximum("HeightMax", height, "Y", angles=angles),
         _formula("OffsetXMax", "M - W", M="WidthMax", W="Width"),
         _formula("OffsetYMax", "M - H", M="HeightMax", H="Height"),
         _register("BinningX", BINNING_X),
@@ -201,7 +201,7 @@ def _region(table: NodeMap, width: int, height: int) -> list[str]:
     return features
 
 
-def _most(name: str, pixels: int, axis: str, *, angles: bool) -> str:
+def _maximum(name: str, pixels: int, axis: str, *, angles: bool) -> str:
     factors = {"B": f"Binning{axis}Register", "D": f"Decimation{axis}Register"}
     if not angles:
         return _formula(name, f"{pixels} / (B * D)", **factors)

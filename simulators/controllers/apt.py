@@ -149,7 +149,7 @@ class APTUnit:
         if message_id in handlers:
             handlers[message_id](message, data)
         elif message_id + 2 in self.stored or message_id + 1 in self.stored:
-            self._store_or_tell(message_id, data)
+            self._store_or_send(message_id, data)
 
     def _send_short(self, message_id: int, first: int, second: int = 0) -> None:
         self._send(struct.pack("<HBBBB", message_id, first, second, HOST, self.address))
@@ -189,7 +189,7 @@ class APTUnit:
         if len(data) == 14:
             self.home_parameters = list(struct.unpack_from("<HHii", data, 2))
 
-    def _store_or_tell(self, message_id: int, data: bytes) -> None:
+    def _store_or_send(self, message_id: int, data: bytes) -> None:
         """Settings come in threes: set n, request n + 1, answer n + 2."""
         if message_id + 2 in self.stored and len(data) == len(self.stored[message_id + 2]) + 2:
             self.stored[message_id + 2] = data[2:]
@@ -197,7 +197,7 @@ class APTUnit:
             self._send_long(message_id + 1, struct.pack("<H", 1) + self.stored[message_id + 1])
 
     def _store(self, _: bytes, data: bytes) -> None:
-        self._store_or_tell(0x0450, data)
+        self._store_or_send(0x0450, data)
 
     def _set_enabled(self, message: bytes, _: bytes) -> None:
         self.enabled = message[3] == 1

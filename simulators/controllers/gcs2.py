@@ -70,12 +70,12 @@ class GCS2Emulator(Emulator):
         for byte in data:
             # Single bytes are heard at once, also in the middle of a line.
             if byte in (MOVING, READY, STOP_ALL):
-                self._single(byte)
+                self._single_byte_command(byte)
             else:
                 for line in self._lines.lines(bytes([byte])):
                     self._command(line.strip())
 
-    def _single(self, byte: int) -> None:
+    def _single_byte_command(self, byte: int) -> None:
         self._apply_faults()
         if byte == MOVING:
             bits = sum(stage.axis.is_moving() << index for index, stage in enumerate(self.stages))

@@ -263,7 +263,7 @@ class XPSConversation(Emulator):
     def _gather(self, name: str, words: list[str]) -> str:
         gathering, now_s = self._controller.gathering, self.clock.now_s()
         if name == "ConfigurationSet":
-            self._controller.gathering = Gathering([self._gathered(word) for word in words])
+            self._controller.gathering = Gathering([self._parse_quantity(word) for word in words])
         elif name == "ConfigurationGet":
             names = {group.axis: group.name for group in self._controller.groups.values()}
             return ";".join(f"{names[axis]}.Pos.{quantity}" for axis, quantity in gathering.types)
@@ -290,7 +290,7 @@ class XPSConversation(Emulator):
             raise XpsError(UNKNOWN)
         return ""
 
-    def _gathered(self, word: str) -> tuple[EmulatedAxis, str]:
+    def _parse_quantity(self, word: str) -> tuple[EmulatedAxis, str]:
         """The axis of ``Group1.Pos.CurrentPosition`` and what is gathered of it."""
         group, _, quantity = word.partition(".Pos.")
         if group not in self._controller.groups or quantity not in ("CurrentPosition", "CurrentVelocity"):

@@ -51,7 +51,7 @@ class FeatureValues:
         if "PayloadSize" not in nodes:
             raise nodes.error("PayloadSize", "is missing, and a capture needs it")
         for name in ("Width", "Height", *EXPOSURES, *_NUMBERS, *GAIN_DB, *GAIN_RAW, *BLACK_LEVEL):
-            if self._has(name):
+            if self._is_available(name):
                 nodes.value(name)
                 nodes.limit(name, "Min")
                 nodes.limit(name, "Max")
@@ -74,32 +74,32 @@ class FeatureValues:
     def _frame_start(self) -> contextlib.AbstractContextManager[None]:
         return self._nodes.assuming("TriggerSelector", "FrameStart")
 
-    def _has(self, name: str) -> bool:
+    def _is_available(self, name: str) -> bool:
         if name not in self._nodes:
             return False
         node = self._nodes.node(name)
         return self._nodes.is_true(node, "pIsImplemented") and self._nodes.is_true(node, "pIsAvailable")
 
     def _first(self, names: Sequence[str]) -> str | None:
-        return next((name for name in names if self._has(name)), None)
+        return next((name for name in names if self._is_available(name)), None)
 
     def _number(self, names: Sequence[str], otherwise: Number) -> Number:
         name = self._first(names)
         return otherwise if name is None else self._nodes.value(name)
 
     def _flag(self, name: str) -> bool:
-        if not self._has(name):
+        if not self._is_available(name):
             return False
         return self._nodes.value(name) == int(self._nodes.node(name).findtext("OnValue") or 1)
 
     def number(self, name: str) -> float | None:
         """A number, or None where the camera has it not."""
         with self._frame_start():
-            return float(self._nodes.value(name)) if self._has(name) else None
+            return float(self._nodes.value(name)) if self._is_available(name) else None
 
     def entry(self, name: str) -> str | None:
         """The chosen entry of an enumeration; "Off" or "On" of a flag; None where the camera has it not."""
-        if not self._has(name):
+        if not self._is_available(name):
             return None
         if self._nodes.node(name).tag == "Enumeration":
             return self._nodes.chosen(name)
@@ -138,7 +138,7 @@ class FeatureValues:
 
     def trigger_source(self) -> str | None:
         """What starts a frame; None where nothing has to."""
-        if not (self._has("TriggerMode") and self._has("TriggerSource")):
+        if not (self._is_available("TriggerMode") and self._is_available("TriggerSource")):
             return None
         with self._frame_start():
             if self._nodes.chosen("TriggerMode") == "Off":
@@ -149,7 +149,7 @@ class FeatureValues:
         """Numbers of the events of a moment that a host has asked for."""
         nodes, selector, switch = self._nodes, "EventSelector", "EventNotification"
         numbers = []
-        for name in EVENTS[moment] if self._has(selector) and self._has(switch) else ():
+        for name in EVENTS[moment] if self._is_available(selector) and self._is_available(switch) else ():
             if name in nodes.entries(selector) and f"Event{name}" in nodes:
                 with nodes.assuming(selector, name):
                     # Makers have several words for on.
@@ -212,9 +212,9 @@ class FeatureValues:
         """Tell the state of the exposure: TriggerArmed, and AcquisitionStatus for every entry of its selector."""
         self._exposing, self._armed = exposing, armed
         nodes, (selector, status) = self._nodes, _STATUS
-        if self._has("TriggerArmed"):
+        if self._is_available("TriggerArmed"):
             self._tell_flag("TriggerArmed", armed)
-        if not (self._has(selector) and self._has(status)):
+        if not (self._is_available(selector) and self._is_available(status)):
             return
         states = {"ExposureActive": exposing, "FrameActive": exposing, "FrameTriggerWait": armed}
         now = nodes.chosen(selector)

@@ -103,7 +103,7 @@ class NodeTree:
             if node.tag in _CONVERTERS:
                 return self._calculated(name, "FormulaFrom", {"TO": self.value(self._target(name) or "")})
             target = self._target(name)
-            return self._own(name) if target is None else self.value(target)
+            return self._own_value(name) if target is None else self.value(target)
 
     def set_value(self, name: str, value: Number) -> None:
         """Set a node through whatever stands behind it, whether a program may or not. Raises NodeError."""
@@ -312,7 +312,7 @@ class NodeTree:
             return node.findtext("pValueDefault")
         return node.findtext("pValue")
 
-    def _own(self, name: str) -> Number:
+    def _own_value(self, name: str) -> Number:
         if name in self._kept:
             return self._kept[name]
         node = self.node(name)
