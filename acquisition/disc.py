@@ -114,7 +114,7 @@ class DiscProcess:
             self._jobs.put((future, (function, arguments), frame))
         return future
 
-    def call(self, what: str, function: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
+    def call(self, task: str, function: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
         """Call a function there and return what it returns.
 
         Raises
@@ -127,7 +127,7 @@ class DiscProcess:
             since_s = self._busy_since_s
             if since_s is not None and time.monotonic() - since_s > self._patience_s:
                 raise AcquisitionError(
-                    f"{what}: the disc has not answered for {time.monotonic() - since_s:.0f} s. The light is off. Go "
+                    f"{task}: the disc has not answered for {time.monotonic() - since_s:.0f} s. The light is off. Go "
                     "on with the same command, or --resume, when the disc works again."
                 )
         return future.result()
@@ -248,9 +248,9 @@ def end_disc() -> None:
         ending.end()
 
 
-def on_disc(what: str, function: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
+def on_disc(task: str, function: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
     """Call a function in the disc process; a disc that hangs never holds the caller. Raises as `DiscProcess.call`."""
-    return function(*arguments, **options) if _is_child else disc().call(what, function, *arguments, **options)
+    return function(*arguments, **options) if _is_child else disc().call(task, function, *arguments, **options)
 
 
 # --- in the child ----------------------------------------------------------------------------------------------------
@@ -295,12 +295,12 @@ def _send(line: Connection, answer: tuple[bool, Any]) -> None:
         line.send((False, AcquisitionError(f"the answer of the disc process cannot be sent: {error}")))
 
 
-def _close_all_but(*kept: int) -> None:
+def _close_all_but(*descriptors: int) -> None:
     """Close what was inherited; the standard streams lead nowhere, so that nobody waits for their end."""
     nothing = os.open(os.devnull, os.O_RDWR)
     for number in (0, 1, 2):
         os.dup2(nothing, number)
     for number in map(int, os.listdir("/proc/self/fd")):
-        if number > 2 and number not in kept:
+        if number > 2 and number not in descriptors:
             with contextlib.suppress(OSError):
                 os.close(number)

@@ -66,13 +66,13 @@ class Stopped(AcquisitionError):
 class Differs(AcquisitionError):
     """What is there was begun with something else than what would go on now. Holds every difference."""
 
-    def __init__(self, what: str, found: list[str]) -> None:
+    def __init__(self, subject: str, changes: list[str]) -> None:
         super().__init__(
-            f"{what} was begun with another set-up:\n"
-            + "\n".join(f"  - {line}" for line in found)
+            f"{subject} was begun with another set-up:\n"
+            + "\n".join(f"  - {line}" for line in changes)
             + "\nNothing was moved or changed. Restore the first set-up, or start a separate file with --as-new."
         )
-        self.what, self.found = what, found
+        self.what, self.found = subject, changes
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.what, self.found)

@@ -48,7 +48,7 @@ def change(name: str, factor: float) -> None:
     setattr(module, name, max(1, round(changed)) if isinstance(value, int) else changed)
 
 
-def judged(folder: Path, seeds: Sequence[int], given: str) -> list[dict[str, Any]]:
+def judged(folder: Path, seeds: Sequence[int], capture_set: str) -> list[dict[str, Any]]:
     """What became of each bench with the numbers as they are in this process."""
     from simulators.blind.bench_run import judge_bench
     from simulators.blind.real_bench import read_truth
@@ -56,7 +56,7 @@ def judged(folder: Path, seeds: Sequence[int], given: str) -> list[dict[str, Any
     out = []
     for seed in seeds:
         truth = next(iter(read_truth(folder, f"real_{seed:04d}")))
-        judgement, _ = judge_bench(folder, truth, ROOT / "configs", given)
+        judgement, _ = judge_bench(folder, truth, ROOT / "configs", capture_set)
         sure = [c for c in judgement.causes if c.certainty == "sure"]
         out.append(
             {
@@ -71,10 +71,10 @@ def judged(folder: Path, seeds: Sequence[int], given: str) -> list[dict[str, Any
 
 
 def in_a_process_of_its_own(
-    folder: Path, seeds: Sequence[int], given: str, name: str = "", *, factor: float = 1.0
+    folder: Path, seeds: Sequence[int], capture_set: str, name: str = "", *, factor: float = 1.0
 ) -> list[dict[str, Any]]:
     """The same in a new process, which reads the changed number."""
-    command = [sys.executable, __file__, name, "--child", str(folder), "--factor", str(factor), "--given", given]
+    command = [sys.executable, __file__, name, "--child", str(folder), "--factor", str(factor), "--given", capture_set]
     done = subprocess.run(
         [c for c in (*command, "--seeds", ",".join(map(str, seeds))) if c], capture_output=True, text=True, check=True
     )
@@ -90,14 +90,14 @@ def row(now: Sequence[dict[str, Any]], plain: Sequence[dict[str, Any]]) -> str:
     return f"{ratio:8.2f} {worse:6d} {right:6d} {wrong:6d} {verdicts:9d}"
 
 
-def lines(names: Sequence[str], folder: Path, seeds: Sequence[int], given: str) -> Iterator[str]:
+def lines(names: Sequence[str], folder: Path, seeds: Sequence[int], capture_set: str) -> Iterator[str]:
     """The table, a line as soon as it is known."""
-    plain = in_a_process_of_its_own(folder, seeds, given)
+    plain = in_a_process_of_its_own(folder, seeds, capture_set)
     yield f"{'number':28s} {'factor':>6s} {'M ratio':>8s} {'worse':>6s} {'right':>6s} {'wrong':>6s} {'verdicts':>9s}"
     yield f"{'as they are':28s} {'':6s} {row(plain, plain)}"
     for name in names:
         for factor in FACTORS:
-            changed = in_a_process_of_its_own(folder, seeds, given, name, factor=factor)
+            changed = in_a_process_of_its_own(folder, seeds, capture_set, name, factor=factor)
             yield f"{name:28s} {factor:6g} {row(changed, plain)}"
 
 

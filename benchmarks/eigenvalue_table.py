@@ -69,12 +69,12 @@ def deviations(first: float, second: float) -> np.ndarray:
     return np.asarray(true - true.mean())
 
 
-def weights(seen: np.ndarray) -> np.ndarray:
+def weights(observed: np.ndarray) -> np.ndarray:
     """Weights (draws, nodes) of linear interpolation between the nodes of the table."""
-    out = np.ones((len(seen), 1))
-    for gap in (seen[:, 0] - seen[:, 1], seen[:, 1] - seen[:, 2]):
+    out = np.ones((len(observed), 1))
+    for gap in (observed[:, 0] - observed[:, 1], observed[:, 1] - observed[:, 2]):
         hats = np.stack([np.interp(gap, GAPS, hat) for hat in np.eye(len(GAPS))], axis=1)
-        out = (out[:, :, None] * hats[:, None, :]).reshape(len(seen), -1)
+        out = (out[:, :, None] * hats[:, None, :]).reshape(len(observed), -1)
     return out
 
 

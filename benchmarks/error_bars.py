@@ -171,12 +171,12 @@ def _planes(image: object, extra: Sequence[str]) -> dict[str, np.ndarray]:
     }
 
 
-def table(found: Sequence[Cell]) -> str:
+def table(results: Sequence[Cell]) -> str:
     """Markdown: of every quantity and light level the median and the range of coverage and pulls."""
     lines = ["| quantity | electrons | cells | 68 % | 95 % | pull | in all limits |", "|---|---|---|---|---|---|---|"]
-    for name in dict.fromkeys(c.quantity for c in found):
-        for electrons in dict.fromkeys(c.electrons for c in found):
-            some = [c for c in found if c.quantity == name and c.electrons == electrons]
+    for name in dict.fromkeys(c.quantity for c in results):
+        for electrons in dict.fromkeys(c.electrons for c in results):
+            some = [c for c in results if c.quantity == name and c.electrons == electrons]
             if some:
                 parts = [[100 * c.in_68 for c in some], [100 * c.in_95 for c in some]]
                 shown = [f"{np.median(p):.0f} ({min(p):.0f} to {max(p):.0f})" for p in parts]
@@ -187,12 +187,12 @@ def table(found: Sequence[Cell]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def table_of_everything(found: Sequence[Cell]) -> str:
+def table_of_everything(results: Sequence[Cell]) -> str:
     """Markdown: of cells whose 95 % intervals cover above 97 %, how many do so as their data do not say more."""
     lines = ["| quantity | electrons | above 97 % | by whole ranges | whole ranges | others |", 6 * "|---" + "|"]
-    for name in dict.fromkeys(c.quantity for c in found):
-        for electrons in dict.fromkeys(c.electrons for c in found):
-            some = [c for c in found if c.quantity == name and c.electrons == electrons]
+    for name in dict.fromkeys(c.quantity for c in results):
+        for electrons in dict.fromkeys(c.electrons for c in results):
+            some = [c for c in results if c.quantity == name and c.electrons == electrons]
             above = [c for c in some if c.in_95 > MOST_95]
             # The others cover no more than they claim, or are too few to tell.
             by_range = [c for c in above if not c.in_95_others > MOST_95 or c.everything > 1 - FEW]

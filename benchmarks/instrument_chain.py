@@ -96,7 +96,7 @@ def emulated(
 
 
 def chain(
-    name: str, air: Path, other: Path, file: Path, *, truth: Callable[[dict[str, Array]], Array], reference: str
+    name: str, air: Path, sample: Path, file: Path, *, truth: Callable[[dict[str, Array]], Array], reference: str
 ) -> Row:
     """Diagnose a capture, write, and reduce another with both files."""
     model = InstrumentModel.load(file)
@@ -110,7 +110,7 @@ def chain(
     train.write_text(dump_yaml(InstrumentModel.load(new).model_copy(update={"effects": (), "systematic": ()})))
     errors = []
     for k, used in enumerate((file, train, new)):
-        product = means_of(Reduction(other, used).make(other.with_suffix(f".{k}.h5"), True))
+        product = means_of(Reduction(sample, used).make(sample.with_suffix(f".{k}.h5"), True))
         values, stated = relative(product)
         expected = truth(product).reshape(values.shape)
         valid = np.isfinite(values) & (np.arange(values.size) > 0)
@@ -135,7 +135,7 @@ def half_wave_plate(nm: int, files: Mapping[str, Path], folder: Path, draw: int 
     def truth(product: dict[str, Array]) -> Array:
         # Air leaves the sign of row and column 3 open.
         m = product["mueller"] / product["mueller"][0, 0]
-        return min((reference, flip @ reference @ flip), key=lambda one: _rms(one - m))
+        return min((reference, flip @ reference @ flip), key=lambda candidate: _rms(candidate - m))
 
     if draw:
         indices = sorted(np.random.default_rng(draw).choice(len(air.rows), len(air.rows) - 10, replace=False))

@@ -56,10 +56,10 @@ class PeerProcess:
         self._process.wait()
 
 
-def peer_python(given: Path | None, console: Console) -> Path | None:
+def peer_python(interpreter: Path | None, console: Console) -> Path | None:
     """The peers' interpreter; makes their environment where none is given."""
-    if given is not None:
-        return given
+    if interpreter is not None:
+        return interpreter
     folder = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "umov/peers"
     python = folder / "bin/python"
     requirements, stamp = HERE / "requirements.txt", folder / "complete"

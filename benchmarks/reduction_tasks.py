@@ -60,7 +60,7 @@ def frames_of_a_ball(shape: tuple[int, int], states: int) -> list[np.ndarray]:
 def write_frames(
     path: Path,
     shape: tuple[int, int],
-    taken: Callable[[tuple[int, int], int], list[np.ndarray]] = some_frames,
+    make_frames: Callable[[tuple[int, int], int], list[np.ndarray]] = some_frames,
     omega_deg: float | None = None,
 ) -> tuple[float, float]:
     """A capture of 40 states through the writer of `acquire`; seconds to create it and to fill it."""
@@ -75,7 +75,7 @@ def write_frames(
         detector=Detector(black_level_counts=50, gain_e_per_count=2.6, read_noise_e=2.3, full_well_e=1e6, bits=16),
         instrument_yaml=INSTRUMENT.read_text(encoding="utf-8"),
     )
-    frames = taken(shape, len(table))
+    frames = make_frames(shape, len(table))
     begin = time.perf_counter()
     writer = CaptureWriter.create(path, header, table, shape, start_time="2026-01-01T00:00:00+00:00")
     created = time.perf_counter()

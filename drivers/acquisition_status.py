@@ -43,10 +43,10 @@ class AcquisitionStatus:
             return self._features.flag(_ARMED)
         return not self.tells_armed or self._status(_WAITING)
 
-    def _status(self, which: str) -> bool:
+    def _status(self, status: str) -> bool:
         if self._features is None:
             return False
-        if self._selected != which:
-            self._features.set_choice(_SELECTOR, which)
-            self._selected = which
+        if self._selected != status:
+            self._features.set_choice(_SELECTOR, status)
+            self._selected = status
         return self._features.flag(_STATUS)

@@ -23,13 +23,13 @@ class AgreeingReadings:
         self._disturbed_s = -float("inf")
 
     def read(
-        self, asked: str, read: Callable[[], float], is_moving: Callable[[], bool], tolerance: float
+        self, request: str, read: Callable[[], float], is_moving: Callable[[], bool], tolerance: float
     ) -> tuple[float, bool]:
         """Return the number, and False if it is that of an axis in motion.
 
         Parameters
         ----------
-        asked : str
+        request : str
             What is read, for the error.
         read, is_moving : callable
             Ask the device.
@@ -42,13 +42,13 @@ class AgreeingReadings:
             Readings at rest contradict each other.
         """
         try:
-            return self._read(asked, read, is_moving, tolerance)
+            return self._read(request, read, is_moving, tolerance)
         except ReplyError:
             self._disturbed_s = self._clock.now_s()
             raise
 
     def _read(
-        self, asked: str, read: Callable[[], float], is_moving: Callable[[], bool], tolerance: float
+        self, request: str, read: Callable[[], float], is_moving: Callable[[], bool], tolerance: float
     ) -> tuple[float, bool]:
         disturbed = self._clock.now_s() - self._disturbed_s < _MEMORY_S
         alike = _DISTURBED if disturbed else _CALM
@@ -72,7 +72,7 @@ class AgreeingReadings:
                 self._disturbed_s = self._clock.now_s()
                 alike = _DISTURBED
         raise ReplyError(
-            asked,
+            request,
             f"readings at rest that contradict each other: {readings}",
             "The line is disturbed: check cable, grounding and baud rate",
         )

@@ -113,13 +113,13 @@ def _find(name: str, device: str | None, aravis: Any) -> str:
     return matches[0]["id"]
 
 
-def _not_found(name: str, device: str | None, found: list[dict[str, str]], detail: str) -> CameraNotFound:
-    listing = ", ".join(f"{c['id']} (serial {c['serial_number']}, at {c['address']})" for c in found) or "no camera"
+def _not_found(name: str, device: str | None, cameras: list[dict[str, str]], detail: str) -> CameraNotFound:
+    listing = ", ".join(f"{c['id']} (serial {c['serial_number']}, at {c['address']})" for c in cameras) or "no camera"
     return CameraNotFound(
         f"open camera {name} ({device or 'the only one'})",
         f"found {listing}" + (f"; {detail}" if detail else ""),
         "Check power and cable, and that the interface is in the camera's subnet"
-        if not found
+        if not cameras
         else "Set `device` in the rig file to one of those",
     )
 

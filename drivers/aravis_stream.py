@@ -123,9 +123,9 @@ class FrameStream:
         self._memory.clear()
 
 
-def let_go(left: list[Any]) -> None:
+def let_go(references: list[Any]) -> None:
     """Close the stream that comes first in the list, if any, and drop the last references to what follows it."""
-    stream = left[0]
+    stream = references[0]
     if stream is not None:
         stream.close()
-    left.clear()
+    references.clear()

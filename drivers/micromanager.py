@@ -15,7 +15,7 @@ from drivers.errors import CommandRejected, DeviceError
 NOT_TOLD = "not told by the core"
 
 
-def running_core(asked: str, configuration: Path | None, device: str) -> Any:
+def running_core(request: str, configuration: Path | None, device: str) -> Any:
     """Return the core of this process; loads the configuration if it has no device of that name yet.
 
     Raises
@@ -26,10 +26,10 @@ def running_core(asked: str, configuration: Path | None, device: str) -> Any:
     try:
         from pymmcore_plus import CMMCorePlus
     except ImportError as error:
-        raise DeviceError(asked, "pymmcore-plus is not installed", "Install it: pip install pymmcore-plus") from error
+        raise DeviceError(request, "pymmcore-plus is not installed", "Install it: pip install pymmcore-plus") from error
     core: Any = CMMCorePlus.instance()
     if configuration is not None and device not in core.getLoadedDevices():
-        with asking(f"{asked}, load {configuration}", "Try the file in Micro-Manager"):
+        with asking(f"{request}, load {configuration}", "Try the file in Micro-Manager"):
             core.loadSystemConfiguration(str(configuration))
     return core
 
@@ -41,7 +41,7 @@ def loaded_devices(core: Any) -> str:
 
 @contextmanager
 def asking(
-    asked: str, what_to_do: str = "Look at the device in Micro-Manager", kind: type[DeviceError] = CommandRejected
+    request: str, what_to_do: str = "Look at the device in Micro-Manager", kind: type[DeviceError] = CommandRejected
 ) -> Iterator[None]:
     """Turn an error of the core or of an adapter inside the block into one of the given kind."""
     try:
@@ -49,4 +49,4 @@ def asking(
     except DeviceError:
         raise
     except Exception as error:
-        raise kind(asked, str(error) or type(error).__name__, what_to_do) from error
+        raise kind(request, str(error) or type(error).__name__, what_to_do) from error

@@ -341,10 +341,10 @@ class MotionAxis(ABC):
             # A stop from another thread overtook the command on the line: it holds for this motion as well.
             self._do_stop()
 
-    def _require_idle(self, what: str) -> None:
+    def _require_idle(self, request: str) -> None:
         if self.is_moving():
             raise CommandRejected(
-                f"axis {self.name}, {what}", "the axis is still moving", "Wait for its motion or stop it first"
+                f"axis {self.name}, {request}", "the axis is still moving", "Wait for its motion or stop it first"
             )
 
     def stop(self) -> None:

@@ -145,7 +145,7 @@ class NeutralFeatures:
         Those of the open camera; its acquisition is stopped.
     user_set : str or None
         The set that is loaded first; None loads none.
-    kept : collection of str
+    exempt : collection of str
         Features of the rig file: they are set on purpose, so no rule is applied to them.
 
     Attributes
@@ -154,8 +154,8 @@ class NeutralFeatures:
         What could not be set, in words, for `acquire doctor` and the capture file.
     """
 
-    def __init__(self, name: str, features: Features, user_set: str | None, kept: Collection[str]) -> None:
-        self._name, self._features, self._user_set, self._kept = name, features, user_set, frozenset(kept)
+    def __init__(self, name: str, features: Features, user_set: str | None, exempt: Collection[str]) -> None:
+        self._name, self._features, self._user_set, self._kept = name, features, user_set, frozenset(exempt)
         self._is_loaded = False
         self._known: list[tuple[str, Rule]] | None = None
         self.remarks: list[str] = []

@@ -9,14 +9,14 @@ from drivers.errors import DeviceError
 from drivers.serial_link import LineRegistry
 
 
-def check_wavelengths(places: Mapping[float, int], what: str, others: Iterable[float] = ()) -> None:
+def check_wavelengths(places: Mapping[float, int], title: str, valued_nm: Iterable[float] = ()) -> None:
     """Refuse a rig file that gives one place to two wavelengths, or a value to a wavelength that has no place.
 
     Parameters
     ----------
     places : wavelength in nm to filter position, terminal or channel.
-    what : a place in words.
-    others : wavelengths of the values.
+    title : a place in words.
+    valued_nm : wavelengths of the values.
 
     Raises
     ------
@@ -25,9 +25,9 @@ def check_wavelengths(places: Mapping[float, int], what: str, others: Iterable[f
     first: dict[int, float] = {}
     for nm, place in places.items():
         if place in first:
-            raise ValueError(f"{what} {place} is that of {first[place]:g} nm and of {nm:g} nm")
+            raise ValueError(f"{title} {place} is that of {first[place]:g} nm and of {nm:g} nm")
         first[place] = nm
-    for nm in others:
+    for nm in valued_nm:
         if nm not in places:
             listing = ", ".join(f"{nm:g}" for nm in places)
             raise ValueError(f"percent is given for {nm:g} nm, and the wavelengths are {listing} nm")

@@ -33,4 +33,4 @@ class TextLine(ControllerLine):
         ReplyTimeout, ReplyError
         """
         request, question = f"{self.controller} {self.link.port}, {command}", f"{command}{self.end}".encode("ascii")
-        return ask(self.link, question, text_of(form), self.reply_s, asked=request, what_to_check=self.what_to_check)
+        return ask(self.link, question, text_of(form), self.reply_s, request=request, what_to_check=self.what_to_check)

@@ -16,7 +16,7 @@ def ask(
     read: Callable[[bytes], T | None],
     reply_s: float,
     *,
-    asked: str,
+    request: str,
     what_to_check: str,
     tries: int = 2,
 ) -> T:
@@ -27,7 +27,7 @@ def ask(
     question : bytes to write.
     read : gets each frame and returns what it says, or None if it is no reply to this question.
     reply_s : longest wait, for each of the tries.
-    asked, what_to_check : for the messages.
+    request, what_to_check : for the messages.
 
     Raises
     ------
@@ -46,8 +46,8 @@ def ask(
                 frames.append(frame)
             link.purge()
     if frames:
-        raise ReplyError(asked, f"no valid reply, but {frames[:3]}", what_to_check)
-    raise ReplyTimeout(asked, f"nothing within {reply_s} s", what_to_check)
+        raise ReplyError(request, f"no valid reply, but {frames[:3]}", what_to_check)
+    raise ReplyTimeout(request, f"nothing within {reply_s} s", what_to_check)
 
 
 def text_of(form: re.Pattern[str]) -> Callable[[bytes], str | None]:

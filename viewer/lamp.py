@@ -42,9 +42,9 @@ def lamp(capture: Capture) -> dict[str, Any]:
     return {"states": [], "ratio": [], "told": method}
 
 
-def _lamp_entry(capture: Capture, states: NDArray[np.int64], ratio: NDArray[np.float64], told: str) -> dict[str, Any]:
+def _lamp_entry(capture: Capture, states: NDArray[np.int64], ratio: NDArray[np.float64], method: str) -> dict[str, Any]:
     keep = np.isfinite(ratio)
-    return {"states": capture.done[states][keep].tolist(), "ratio": ratio[keep].tolist(), "told": told}
+    return {"states": capture.done[states][keep].tolist(), "ratio": ratio[keep].tolist(), "told": method}
 
 
 def _dark_corrected(capture: Capture, light: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -83,15 +83,15 @@ def _fitted(capture: Capture, light: NDArray[np.int64], signal: NDArray[np.float
 
 
 def _predict_from_others(
-    w: NDArray[np.float64], signal: NDArray[np.float64], known: NDArray[np.bool_]
+    w: NDArray[np.float64], signal: NDArray[np.float64], valid: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """What the other states make of each one: a fit with all of them would follow a flash halfway."""
-    u, s, _ = np.linalg.svd(w[known], full_matrices=False)
+    u, s, _ = np.linalg.svd(w[valid], full_matrices=False)
     u = u[:, s > 1e-8 * s[0]]
     leverage = np.square(u).sum(axis=1)
-    residual = signal[known] - u @ (u.T @ signal[known])
+    residual = signal[valid] - u @ (u.T @ signal[valid])
     out = np.full(len(signal), np.nan)
     # A state that alone tells one of the numbers tells nothing of the lamp.
     with np.errstate(divide="ignore", invalid="ignore"):
-        out[known] = np.where(leverage < TELLING, signal[known] - residual / (1 - leverage), np.nan)
+        out[valid] = np.where(leverage < TELLING, signal[valid] - residual / (1 - leverage), np.nan)
     return out

@@ -51,10 +51,10 @@ async def write_note(request: Request) -> JSONResponse:
     return await run_in_threadpool(_write_note, pages_of(request).library, fields)
 
 
-def _write_note(library: Library, asked: dict[str, str]) -> JSONResponse:
-    name = library.name(library.path(asked.get("file", "")))
-    text = asked.get("text", "").strip()
-    tags = tuple(dict.fromkeys(tag for part in asked.get("tags", "").split(",") if (tag := part.strip())))
+def _write_note(library: Library, fields: dict[str, str]) -> JSONResponse:
+    name = library.name(library.path(fields.get("file", "")))
+    text = fields.get("text", "").strip()
+    tags = tuple(dict.fromkeys(tag for part in fields.get("tags", "").split(",") if (tag := part.strip())))
     if len(text) > LONGEST or sum(map(len, tags)) > LONGEST_TAGS or not all(map(is_line, tags)):
         raise ProcessError(f"a note has at most {LONGEST} characters, and the tags have at most {LONGEST_TAGS}")
     note = Note(text=text, tags=tags)

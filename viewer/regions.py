@@ -79,9 +79,9 @@ async def keep_region(request: Request) -> JSONResponse:
     return await run_in_threadpool(_keep_region, pages_of(request).library, fields)
 
 
-def _keep_region(library: Library, asked: dict[str, str]) -> JSONResponse:
-    shape = MeasuredImage(library.path(asked.get("file", ""))).shape
-    place, name = Region.asked(asked, shape), asked.get("name", "").strip()
+def _keep_region(library: Library, fields: dict[str, str]) -> JSONResponse:
+    shape = MeasuredImage(library.path(fields.get("file", ""))).shape
+    place, name = Region.asked(fields, shape), fields.get("name", "").strip()
     if not NAME.fullmatch(name):
         raise ProcessError("a region has a name of up to 40 letters, digits, spaces and signs . ( ) + - _")
     columns, rows = ((part.start, part.stop) for part in (place.columns, place.rows))
@@ -270,17 +270,17 @@ def _wrap(off: NDArray[np.float64], period: float | None) -> NDArray[np.float64]
     return off if period is None else np.asarray((off + period / 2) % period - period / 2)
 
 
-def _error(found: _Pixels, good: NDArray[np.bool_]) -> float:
+def _error(pixels: _Pixels, good: NDArray[np.bool_]) -> float:
     """Standard error of the mean by the noise of each pixel; NaN where one is not known."""
-    if not np.isfinite(found.errors[good]).all():
+    if not np.isfinite(pixels.errors[good]).all():
         return float("nan")
-    total = shared_variance(np.where(good, 0, -1), found.errors, found.correlation)[good].sum()
+    total = shared_variance(np.where(good, 0, -1), pixels.errors, pixels.correlation)[good].sum()
     return float(np.sqrt(total) / good.sum())
 
 
-def _systematic(found: _Pixels, good: NDArray[np.bool_]) -> float:
+def _systematic(pixels: _Pixels, good: NDArray[np.bool_]) -> float:
     """An error that all pixels share does not average."""
-    return float("nan") if found.systematic is None else float(found.systematic[good].mean())
+    return float("nan") if pixels.systematic is None else float(pixels.systematic[good].mean())
 
 
 def _edges(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -23,11 +23,11 @@ def read_kept(library: Library, file: str, kind: type[Kept]) -> Kept:
         raise ProcessError(f"{path} is damaged. Correct it, or move it away.") from error
 
 
-def write_kept(library: Library, file: str, kept: BaseModel) -> None:
+def write_kept(library: Library, file: str, content: BaseModel) -> None:
     """Replace a file. Raises ProcessError."""
     path = library.root / OWN / file
     try:
         path.parent.mkdir(exist_ok=True)
-        write_whole_text(path, kept.model_dump_json(indent=1) + "\n")
+        write_whole_text(path, content.model_dump_json(indent=1) + "\n")
     except OSError as error:
         raise ProcessError(f"{path} cannot be written ({error.strerror})") from error

@@ -41,10 +41,10 @@ async def start(request: Request) -> JSONResponse:
     return JSONResponse({"address": pages.address("job", name=job.name)})
 
 
-def _campaign(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
-    file = campaign_files(library).get(asked.get("file", ""))
+def _campaign(library: Library, jobs: Jobs, fields: dict[str, str]) -> PageJob:
+    file = campaign_files(library).get(fields.get("file", ""))
     if file is None:
-        raise NotHere(f"{asked.get('file')}: there is no such campaign file")
+        raise NotHere(f"{fields.get('file')}: there is no such campaign file")
     campaign = Campaign.load(file)
     rig = campaign.rig or DEFAULT_RIG
     if not (is_own_rig(rig) or rig.resolve().is_relative_to(CONFIGS.resolve())):
@@ -54,7 +54,7 @@ def _campaign(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
             f"--rig {shlex.quote(str(rig))} --dry-run"
         )
     command = ["acquire", "--campaign", str(file), "--rig", str(rig), "--out", str(library.root)]
-    if asked.get("yes"):
+    if fields.get("yes"):
         command.append("--yes")
     return jobs.start(f"campaign {campaign.name}", command, {"campaign": campaign.name}, library.root)
 
@@ -67,10 +67,10 @@ def campaign_files(library: Library) -> dict[str, Path]:
     }
 
 
-def _resume(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
-    folder = library.path(asked.get("folder", ""))
+def _resume(library: Library, jobs: Jobs, fields: dict[str, str]) -> PageJob:
+    folder = library.path(fields.get("folder", ""))
     if read_identity(folder) is None:
-        raise NotHere(f"{asked.get('folder')}: no campaign was begun in this folder")
+        raise NotHere(f"{fields.get('folder')}: no campaign was begun in this folder")
     command = resume_command(folder)
     if command is None:
         raise ProcessError(
@@ -107,34 +107,34 @@ def resumed_with(folder: Path) -> tuple[str, list[str]] | None:
     return shlex.join(command), [entry if isinstance(entry, str) else shlex.join(entry) for entry in named if entry]
 
 
-def _reduce(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
-    capture = library.path(asked.get("file", ""))
+def _reduce(library: Library, jobs: Jobs, fields: dict[str, str]) -> PageJob:
+    capture = library.path(fields.get("file", ""))
     command = ["process", "reduce", str(capture)]
-    if (file := _instrument(library, asked)) is not None:
+    if (file := _instrument(library, fields)) is not None:
         with Capture(capture) as opened:
             out = capture.with_name(f"{capture.stem}.{file.stem}.{opened.reduces_to}.h5")
         command += ["--instrument", str(file), "--out", str(out)]
     return jobs.start(f"reduce {capture.name}", command, {"file": library.name(capture)}, library.root)
 
 
-def _quantities(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
-    product = library.path(asked.get("file", ""))
+def _quantities(library: Library, jobs: Jobs, fields: dict[str, str]) -> PageJob:
+    product = library.path(fields.get("file", ""))
     about = {"file": library.name(product)}
     return jobs.start(f"maps of {product.name}", ["process", "quantities", str(product)], about, library.root)
 
 
-def _diagnose(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
-    captures = [library.path(name) for name in asked.get("files", "").split("\n") if name]
-    name, folder = Diagnoses(library).begin(captures, _instrument(library, asked))
+def _diagnose(library: Library, jobs: Jobs, fields: dict[str, str]) -> PageJob:
+    captures = [library.path(name) for name in fields.get("files", "").split("\n") if name]
+    name, folder = Diagnoses(library).begin(captures, _instrument(library, fields))
     more = ["--residuals", str(folder / "residuals.npz")]
     return _diagnosis(library, jobs, captures, name, folder=folder, more=more)
 
 
-def _surface(library: Library, jobs: Jobs, asked: dict[str, str]) -> PageJob:
-    captures = [library.path(name) for name in asked.get("files", "").split("\n") if name]
-    material = _chosen(material_files(library), asked.get("material", ""), "material")
-    geometry = _chosen(geometry_files(library), asked.get("geometry", ""), "geometry")
-    name, folder = Diagnoses(library).begin(captures, _instrument(library, asked), (material, geometry))
+def _surface(library: Library, jobs: Jobs, fields: dict[str, str]) -> PageJob:
+    captures = [library.path(name) for name in fields.get("files", "").split("\n") if name]
+    material = _chosen(material_files(library), fields.get("material", ""), "material")
+    geometry = _chosen(geometry_files(library), fields.get("geometry", ""), "geometry")
+    name, folder = Diagnoses(library).begin(captures, _instrument(library, fields), (material, geometry))
     more = ["--reflectance", str(folder / "material.yaml"), "--geometry", str(folder / "geometry.yaml")]
     return _diagnosis(library, jobs, captures, name, folder=folder, more=more)
 
@@ -164,20 +164,20 @@ def geometry_files(library: Library) -> dict[str, Path]:
     return _with_examples(library, library.yaml_files("source_distance_mm:"), "geometries")
 
 
-def _with_examples(library: Library, own: list[Path], folder: str) -> dict[str, Path]:
-    files = {library.name(path): path for path in own}
+def _with_examples(library: Library, paths: list[Path], folder: str) -> dict[str, Path]:
+    files = {library.name(path): path for path in paths}
     return files | {f"example: {path.stem}": path for path in sorted((CONFIGS / folder).glob("*.yaml"))}
 
 
-def _instrument(library: Library, asked: dict[str, str]) -> Path | None:
+def _instrument(library: Library, fields: dict[str, str]) -> Path | None:
     """The instrument file that a page chose; None for the model in the capture. Raises NotHere."""
-    name = asked.get("instrument")
+    name = fields.get("instrument")
     return _chosen(instrument_files(library), name, "instrument") if name else None
 
 
-def _chosen(files: dict[str, Path], name: str, what: str) -> Path:
+def _chosen(files: dict[str, Path], name: str, kind: str) -> Path:
     if name not in files:
-        raise NotHere(f"{name}: there is no such {what} file")
+        raise NotHere(f"{name}: there is no such {kind} file")
     return files[name]
 
 
@@ -198,22 +198,22 @@ def job(request: Request) -> HTMLResponse:
     return pages.draw("job.html", simulated=_simulated(pages, page_job), job=page_job, now=told(pages, jobs, page_job))
 
 
-def _simulated(pages: Pages, found: PageJob) -> bool:
+def _simulated(pages: Pages, page_job: PageJob) -> bool:
     """Whether the captures that a job reads, or the devices that it drives, are simulated."""
-    if "file" in found.about:
-        return pages.library.entry(found.about["file"]).simulated
-    rig = dict(zip(found.command, found.command[1:], strict=False)).get("--rig")
+    if "file" in page_job.about:
+        return pages.library.entry(page_job.about["file"]).simulated
+    rig = dict(zip(page_job.command, page_job.command[1:], strict=False)).get("--rig")
     try:
         return rig is not None and load_rig(rig).simulated
     except ProcessError:
         return False
 
 
-def told(pages: Pages, jobs: Jobs, found: PageJob) -> dict[str, Any]:
+def told(pages: Pages, jobs: Jobs, page_job: PageJob) -> dict[str, Any]:
     """What a page shows of a job: status, output, and where what it makes is shown."""
-    status = jobs.status(found)
+    status = jobs.status(page_job)
     links = []
-    about, library = found.about, pages.library
+    about, library = page_job.about, pages.library
     if "campaign" in about and (library.root / about["campaign"] / PLAN).exists():
         links.append(["The campaign", pages.address("campaign", folder=about["campaign"])])
     if "diagnosis" in about and status == "done":
@@ -221,10 +221,10 @@ def told(pages: Pages, jobs: Jobs, found: PageJob) -> dict[str, Any]:
     if "file" in about:
         entry = library.entry(about["file"])
         if status == "done" and "diagnosis" not in about:
-            products = [e for e in library.entries() if e.changed_s >= found.begun_s and e.kind != "capture"]
+            products = [e for e in library.entries() if e.changed_s >= page_job.begun_s and e.kind != "capture"]
             links += [[f"{e.kind}: {e.name}", link] for e in products if (link := pages.shown_at(e)) is not None]
         links.append([entry.name, pages.shown_at(entry) or pages.address("")])
-    return {"status": status, "output": jobs.output(found), "links": links}
+    return {"status": status, "output": jobs.output(page_job), "links": links}
 
 
 async def job_events(request: Request) -> StreamingResponse:

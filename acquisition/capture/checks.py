@@ -199,7 +199,7 @@ def check_devices(
 
 
 def _check_first_move(table: StateTable, rig: Rig, state: int, here_deg: Mapping[str, float]) -> CheckResult:
-    by = states_deg(turned(table, turns_to(table, rig, state, here_deg, wanted={})))
+    by = states_deg(turned(table, turns_to(table, rig, state, here_deg, preferred={})))
     if find_way(rig.config, here_deg, by[state], by, limits=rig.limits, first=ARM) is None:
         obstacle = find_obstacle(rig.config, here_deg, {**here_deg, **by[state]}, by[state], limits=rig.limits)
         return CheckResult("first move", False, f"to state {state} it meets {obstacle}, and there is no way round it")
@@ -224,6 +224,6 @@ def _fold_hint(axis: str, rig: RigConfig) -> str:
     )
 
 
-def _member(what: str, value: str, known: list[str]) -> CheckResult:
-    is_listed = value in known
-    return CheckResult(what, is_listed, value if is_listed else f"{value!r} is not one of {', '.join(known)}")
+def _member(title: str, value: str, choices: list[str]) -> CheckResult:
+    is_listed = value in choices
+    return CheckResult(title, is_listed, value if is_listed else f"{value!r} is not one of {', '.join(choices)}")

@@ -109,13 +109,13 @@ def check_with_devices(
     return [*checks, check_disc("disc", folder, needed)]
 
 
-def check_disc(what: str, folder: Path, needed: int) -> CheckResult:
+def check_disc(title: str, folder: Path, needed: int) -> CheckResult:
     """Whether a folder has room for so many bytes."""
     try:
         on_disc(f"look at {folder}", _check_space_in, folder, needed)
     except AcquisitionError as error:
-        return CheckResult(what, False, str(error))
-    return CheckResult(what, True, f"{needed / 1e6:.0f} MB in {folder}")
+        return CheckResult(title, False, str(error))
+    return CheckResult(title, True, f"{needed / 1e6:.0f} MB in {folder}")
 
 
 def _check_space_in(folder: Path, needed: int) -> None:

@@ -37,9 +37,9 @@ def check_machine(rig: RigConfig, samples: Iterable[str]) -> list[CheckResult]:
     return checks
 
 
-def _check_file(what: str, path: Path, load: Callable[[Path], object]) -> CheckResult:
+def _check_file(title: str, path: Path, load: Callable[[Path], object]) -> CheckResult:
     try:
         load(path)
     except ProcessError as error:
-        return CheckResult(what, False, str(error))
-    return CheckResult(what, True, str(path))
+        return CheckResult(title, False, str(error))
+    return CheckResult(title, True, str(path))

@@ -61,13 +61,13 @@ class Operator:
     def _ask(self, change: str) -> None:
         self._answer(change, f"Please {change}, then press Enter.")
 
-    def _answer(self, what: str, prompt: str) -> str:
+    def _answer(self, request: str, prompt: str) -> str:
         if self._simulated or self._yes:
-            self._tell(f"{what} ({'simulated' if self._simulated else '--yes'})")
+            self._tell(f"{request} ({'simulated' if self._simulated else '--yes'})")
             return ""
         if not sys.stdin.isatty():
             raise AcquisitionError(
-                f"this needs an operator: {what}. No terminal is available to ask; use --yes if it is done."
+                f"this needs an operator: {request}. No terminal is available to ask; use --yes if it is done."
             )
         self._tell(prompt)
         while not select.select([sys.stdin], [], [], LOOK_S)[0]:

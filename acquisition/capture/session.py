@@ -164,7 +164,7 @@ def _run(
         mosaic=job.instrument.mosaic is not None,
         lit_darks=None if earlier is None else earlier.darks,
         rows=_rows(job),
-        turns={} if earlier is None else turns_to(job.table, rig, first, rig.where_once_homed(), wanted={}),
+        turns={} if earlier is None else turns_to(job.table, rig, first, rig.where_once_homed(), preferred={}),
     )
     status: Status = "failed"
     failure: BaseException | None = None

@@ -70,11 +70,11 @@ def examine(config: RigConfig, folder: Path, frames: int = FRAMES) -> Iterator[F
         yield Finding("closing", False, str(failure))
 
 
-def _guarded(what: str, look: Callable[[], str]) -> Finding:
+def _guarded(title: str, look: Callable[[], str]) -> Finding:
     try:
-        return Finding(what, True, look())
+        return Finding(title, True, look())
     except (DeviceError, AcquisitionError, ProcessError, ImportError, ValueError) as error:
-        return Finding(what, False, str(error))
+        return Finding(title, False, str(error))
 
 
 def _origin(name: str) -> str:

@@ -221,9 +221,9 @@ def seeded(rig: RigConfig, seed: int | None) -> RigConfig:
 
 
 @contextmanager
-def live_page(wanted: bool, rig: RigConfig, stop: StopRequest, console: Console) -> Iterator[list[Observer]]:
+def live_page(enabled: bool, rig: RigConfig, stop: StopRequest, console: Console) -> Iterator[list[Observer]]:
     """The live page as a list of observers, empty where it is not wanted; prints its address."""
-    if not wanted:
+    if not enabled:
         yield []
         return
     from acquisition.screen.live_view import LiveView

@@ -56,14 +56,14 @@ def give_alarm(rig: str, text: str) -> Path:
     return path
 
 
-def keep(what: str, name: str, text: str) -> str:
+def keep(title: str, name: str, text: str) -> str:
     """Write a text to a file in memory; returns a sentence that says where."""
     try:
         path = _make_folder() / name
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        return f"The {what} could not be kept ({error})."
-    return f"The {what} is in {path}."
+        return f"The {title} could not be kept ({error})."
+    return f"The {title} is in {path}."
 
 
 def unacknowledged() -> list[Alarm]:

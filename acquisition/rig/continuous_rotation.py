@@ -32,7 +32,7 @@ def unwound(table: StateTable, rig: Rig, here_deg: Mapping[str, float] | None = 
             turns = math.ceil((start_deg[name] - 1e-3 - float(table.angles_deg[name].min())) / 360.0)
             if turns > 0 and start_deg[name] < UP_TO_DEG:
                 ahead[name] = turns
-    return turned(table, turns_to(table, rig, 0, start_deg, wanted=ahead))
+    return turned(table, turns_to(table, rig, 0, start_deg, preferred=ahead))
 
 
 def turned(table: StateTable, turns: Mapping[str, int]) -> StateTable:
@@ -42,25 +42,25 @@ def turned(table: StateTable, turns: Mapping[str, int]) -> StateTable:
 
 
 def turns_to(
-    table: StateTable, rig: Rig, state: int, here_deg: Mapping[str, float], *, wanted: Mapping[str, int]
+    table: StateTable, rig: Rig, state: int, here_deg: Mapping[str, float], *, preferred: Mapping[str, int]
 ) -> dict[str, int]:
     """Whole turns to add to the endless axes of a table, so that the way to one of its states is free.
 
     Parameters
     ----------
-    wanted : turns to add where the way with them is free, or no way is.
+    preferred : turns to add where the way with them is free, or no way is.
     """
     names = _endless(table, rig)
     choices = []
     for name in names:
         nearest = round((here_deg.get(name, 0.0) - float(table.angles_deg[name][state])) / 360.0)
-        choices.append(list(dict.fromkeys([wanted.get(name, 0), nearest, nearest + 1, nearest - 1, 0])))
+        choices.append(list(dict.fromkeys([preferred.get(name, 0), nearest, nearest + 1, nearest - 1, 0])))
     for chosen in product(*choices):
         turns = dict(zip(names, chosen, strict=True))
         by = states_deg(turned(table, turns))
         if find_way(rig.config, here_deg, by[state], by, limits=rig.limits) is not None:
             return turns
-    return dict(wanted)
+    return dict(preferred)
 
 
 def states_deg(table: StateTable) -> list[dict[str, float]]:

@@ -187,11 +187,11 @@ class JointAxes:
                     raise AcquisitionError(f"axis {axis.name} still moves after {REST_WITHIN_S:g} s; it was stopped")
                 self.clock.sleep_s(axis.config.poll_s)
 
-    def _next_look_s(self, left: Mapping[str, Motion], elapsed_s: float) -> float:
+    def _next_look_s(self, motions: Mapping[str, Motion], elapsed_s: float) -> float:
         """Pause before the next look at moving axes: short around the time at which the last should arrive."""
-        slowest = max(left.values(), key=lambda motion: motion.expected_s)
+        slowest = max(motions.values(), key=lambda motion: motion.expected_s)
         off_s = abs(slowest.expected_s / self.time_scale - elapsed_s)
-        longest_s = min(self.axes[name].config.poll_s for name in left)
+        longest_s = min(self.axes[name].config.poll_s for name in motions)
         return min(max(off_s / 2, SHORTEST_LOOK_S), longest_s)
 
     def stop(self) -> Exception | None:

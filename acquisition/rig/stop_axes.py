@@ -79,14 +79,14 @@ def _is_acquire(pid: int) -> bool:
 
 
 def _stop_line(
-    port: str, entries: Mapping[str, AxisConfig], lines: LineRegistry, told: set[int], *, tell: Tell
+    port: str, entries: Mapping[str, AxisConfig], lines: LineRegistry, pids: set[int], *, tell: Tell
 ) -> bool:
-    _wait_let_go(port, told)
+    _wait_let_go(port, pids)
     axes = []
     busy: dict[str, AxisConfig] = {}
     for name, entry in entries.items():
         try:
-            axes.append(_stop_let_go(name, entry, lines) if told else _stop_axis(name, entry, lines))
+            axes.append(_stop_let_go(name, entry, lines) if pids else _stop_axis(name, entry, lines))
         except CommandRejected as error:
             tell(f"{name}: answers no question now ({error.came_back}); asked again until it does")
             busy[name] = entry
@@ -136,10 +136,10 @@ def _tell_failed(name: str, error: DeviceError, tell: Tell) -> None:
     tell(f"{name}: {why}. {error}. If it moves, switch its power off")
 
 
-def _wait_let_go(port: str, told: set[int]) -> None:
+def _wait_let_go(port: str, pids: set[int]) -> None:
     # Real time: it is another program that lets go.
     end_s = time.monotonic() + LET_GO_S
-    while time.monotonic() < end_s and any(pid in told for pid, _ in port_holders(port)):
+    while time.monotonic() < end_s and any(pid in pids for pid, _ in port_holders(port)):
         time.sleep(0.05)
 
 

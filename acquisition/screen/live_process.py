@@ -170,13 +170,13 @@ class Page:
             finally:
                 self._clients -= 1
 
-    def _refusal(self, method: str, headers: dict[str, str], given: str) -> bytes | None:
+    def _refusal(self, method: str, headers: dict[str, str], token: str) -> bytes | None:
         """What is said to anyone without the token or from a page of another site."""
         host = headers.get("host", "")
         # Another site that resolves its name to this machine sends its own name as host.
         if host.rsplit(":", 1)[0] not in ("127.0.0.1", "localhost"):
             return b"only for a browser on this machine"
-        if not secrets.compare_digest(given.encode(errors="replace"), self._token):
+        if not secrets.compare_digest(token.encode(errors="replace"), self._token):
             return b"the token is missing or wrong"
         origin = headers.get("origin")
         if origin != f"http://{host}" and not (origin is None and method == "GET"):

@@ -41,12 +41,12 @@ class Notifier(Observer):
 
     Parameters
     ----------
-    what : name of the capture file or of the campaign.
+    subject : name of the capture file or of the campaign.
     """
 
-    def __init__(self, config: NotifyConfig | None, what: Path, simulated: bool) -> None:
+    def __init__(self, config: NotifyConfig | None, subject: Path, simulated: bool) -> None:
         self._config = config
-        self._facts: dict[str, Any] = {"what": str(what), "simulated": simulated}
+        self._facts: dict[str, Any] = {"what": str(subject), "simulated": simulated}
         self._sending: list[threading.Thread] = []
 
     def warning(self, text: str) -> None:
@@ -96,9 +96,9 @@ class Notifier(Observer):
 
 
 @contextmanager
-def notifying(config: NotifyConfig | None, what: Path, simulated: bool) -> Iterator[Notifier]:
+def notifying(config: NotifyConfig | None, subject: Path, simulated: bool) -> Iterator[Notifier]:
     """A notifier around a run: an error of the run is told as a failure, and raised all the same."""
-    notifier = Notifier(config, what, simulated)
+    notifier = Notifier(config, subject, simulated)
     try:
         yield notifier
     except Exception as error:

@@ -111,7 +111,7 @@ class APTLine(ControllerLine):
 
         title = f"APT {self.link.port}, {REPLY_NAMES.get(reply_id, hex(reply_id))}"
         advice = "Is it an APT unit, and the only program on it? A frozen unit needs its power switched off and on"
-        return ask(self.link, request, data_of, self.reply_s, asked=title, what_to_check=advice)
+        return ask(self.link, request, data_of, self.reply_s, request=title, what_to_check=advice)
 
 
 class APTAxis(MotionAxis):

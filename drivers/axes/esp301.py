@@ -76,9 +76,9 @@ class ESP301Line(ControllerLine):
         ------
         ReplyTimeout, ReplyError
         """
-        request, advice = f"ESP301 {self.link.port}, {command}", "Check power, cable, baud rate and RTS/CTS"
+        label, hint = f"ESP301 {self.link.port}, {command}", "Check power, cable, baud rate and RTS/CTS"
         return ask(
-            self.link, f"{command}\r".encode("ascii"), text_of(form), self.reply_s, asked=request, what_to_check=advice
+            self.link, f"{command}\r".encode("ascii"), text_of(form), self.reply_s, request=label, what_to_check=hint
         )
 
     def take_errors(self, axis: int) -> list[int]:
@@ -133,7 +133,7 @@ class ESP301Axis(SessionReferenceAxis):
     def _limit(self, command: str) -> float | None:
         return stage_limit(self._constant(command))
 
-    def _raise_errors(self, asked: str) -> None:
+    def _raise_errors(self, request: str) -> None:
         codes = self._line.take_errors(self.config.axis)
         if codes:
             words = [
@@ -141,7 +141,7 @@ class ESP301Axis(SessionReferenceAxis):
                 for code in codes
             ]
             self._give_up_homing()
-            raise CommandRejected(f"axis {self.name}, {asked}", ", ".join(words), "Look at the controller's display")
+            raise CommandRejected(f"axis {self.name}, {request}", ", ".join(words), "Look at the controller's display")
 
     def _command(self, command: str) -> None:
         axis = self.config.axis

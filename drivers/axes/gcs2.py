@@ -70,7 +70,7 @@ class GCS2Line(ControllerLine):
             _bytes(command),
             text_of(form),
             self.reply_s,
-            asked=request,
+            request=request,
             what_to_check="Check power, cable and baud rate",
         )
 

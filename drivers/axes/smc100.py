@@ -117,7 +117,7 @@ class SMC100Line(ControllerLine):
         tries = 2 if reply_s is None else 1
         advice = "Check power, cable, baud rate, address"
         return ask(
-            self.link, question, value_of, reply_s or self.reply_s, asked=request, what_to_check=advice, tries=tries
+            self.link, question, value_of, reply_s or self.reply_s, request=request, what_to_check=advice, tries=tries
         )
 
 

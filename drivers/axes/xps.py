@@ -83,7 +83,7 @@ class XPSLine(ControllerLine):
             call.encode("ascii"),
             parse,
             self.reply_s,
-            asked=label,
+            request=label,
             what_to_check="Check power, cable and address",
         )
         return _values(answer, label)
@@ -100,16 +100,16 @@ class XPSLine(ControllerLine):
         _values(frame.decode("ascii", "replace"), label)
 
 
-def _values(answer: str, asked: str) -> str:
+def _values(answer: str, request: str) -> str:
     code, _, values = answer.partition(",")
     if not re.fullmatch(r"-?\d+", code):
-        raise ReplyError(asked, f"no code in {answer!r}", "Is it an XPS, and the port 5001?")
+        raise ReplyError(request, f"no code in {answer!r}", "Is it an XPS, and the port 5001?")
     if int(code) == 0:
         return values
     words = f"error {code}: {ERRORS.get(int(code), 'see the manual')}"
     if int(code) == NOT_ALLOWED:
-        raise NotHomedError(asked, words, "Home the axis (acquire home)")
-    raise CommandRejected(asked, words, "Look at the state of the group in the controller's web page")
+        raise NotHomedError(request, words, "Home the axis (acquire home)")
+    raise CommandRejected(request, words, "Look at the state of the group in the controller's web page")
 
 
 class XPSAxis(MotionAxis):
@@ -143,12 +143,12 @@ class XPSAxis(MotionAxis):
             address=positioner,
         )
 
-    def _require_group(self, asked: str) -> None:
+    def _require_group(self, request: str) -> None:
         try:
             self._status()
         except CommandRejected as error:
             raise WrongDevice(
-                f"{asked}, group {self.config.group}", error.came_back, "Correct `group` in the rig file"
+                f"{request}, group {self.config.group}", error.came_back, "Correct `group` in the rig file"
             ) from error
 
     def _ask(self, function: str, values: int) -> tuple[float, ...]:

@@ -58,7 +58,7 @@ class Monochromator(PortSource):
             f"{query}\r\n".encode("ascii"),
             text_of(form),
             reply_s or self.config.reply_s,
-            asked=f"{self._name}, {query}",
+            request=f"{self._name}, {query}",
             what_to_check="Check power, cable and baud rate",
         )
 

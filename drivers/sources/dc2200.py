@@ -135,12 +135,12 @@ class Dc2200(PortSource):
             raise ReplyError(f"{self._name}, LED {terminal}", "two readings differ", "Check the cable")
         return answers[0]
 
-    def _tell(self, command: str, asked: str) -> None:
+    def _tell(self, command: str, request: str) -> None:
         with self._device.lock:
             self._device.write(command)
             code = int(self._ask("SYSTem:ERRor?", _ERROR).partition(",")[0])
         if code != 0:
-            raise CommandRejected(asked, f"error {code}", "The manual lists the errors")
+            raise CommandRejected(request, f"error {code}", "The manual lists the errors")
 
     def _ask(self, query: str, form: re.Pattern[str]) -> str:
         """One query; without an answer of its form it is asked once more.

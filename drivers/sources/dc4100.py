@@ -191,7 +191,7 @@ class Dc4100(PortSource):
     def _status(self) -> int:
         return int(self._number("R?"))
 
-    def _rejection(self, asked: str, came_back: str, channel: int | None = None) -> CommandRejected:
+    def _rejection(self, request: str, came_back: str, channel: int | None = None) -> CommandRejected:
         status = self._status()
         reasons = {SUPPLY_FAILS: "its supply is out of range", TOO_HOT: "it is too hot and has shut off all LEDs"}
         if channel is not None:
@@ -200,7 +200,7 @@ class Dc4100(PortSource):
         error = re.search(r"(-?\d+)\s*:?\s*(.*)", self._ask("E?"))
         if error is not None and int(error[1]) != 0:
             remarks.append(f"error {error[1]} {error[2]}".strip())
-        return CommandRejected(asked, "; ".join([came_back, *remarks]), "Look at the box and its LEDs")
+        return CommandRejected(request, "; ".join([came_back, *remarks]), "Look at the box and its LEDs")
 
     # --- wire --------------------------------------------------------------------------------------------
 
@@ -224,7 +224,7 @@ class Dc4100(PortSource):
             query.encode("ascii") + b"\r\n",
             text_of(form),
             self.config.reply_s,
-            asked=f"LED driver on {self.config.port}, {query}",
+            request=f"LED driver on {self.config.port}, {query}",
             what_to_check="Check power and cable, and that the port is that of the LED driver",
         )
 

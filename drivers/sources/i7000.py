@@ -95,8 +95,8 @@ class RelayModule(PortSource):
             raise ReplyTimeout(request, f"no reply in {self.config.reply_s:g} s", "Check power, cable and address")
         return frame.decode("ascii", "replace").strip()
 
-    def _reply_error(self, asked: str, reply: str) -> ReplyError:
-        return ReplyError(f"{self._name}, {asked}", f"{reply!r}", "The line is disturbed: check cable and baud rate")
+    def _reply_error(self, request: str, reply: str) -> ReplyError:
+        return ReplyError(f"{self._name}, {request}", f"{reply!r}", "The line is disturbed: check cable and baud rate")
 
 
 def open(config: Config, lines: LineRegistry) -> RelayModule:

@@ -117,15 +117,15 @@ def judgement_of(raw: Mapping[str, Any]) -> BenchJudgement:
     )
 
 
-def names_of(result: Result, truth: RealBench, given: Sequence[str]) -> tuple[TrueCause, ...]:
+def names_of(result: Result, truth: RealBench, captures: Sequence[str]) -> tuple[TrueCause, ...]:
     """Every cause of a result, compared with the faults that act in the captures given."""
-    acting = active(truth, given)
+    acting = active(truth, captures)
     return tuple(_cause(e, acting) for e in result["effects"])
 
 
-def active(truth: RealBench, given: Iterable[str]) -> list[TrueFault]:
+def active(truth: RealBench, captures: Iterable[str]) -> list[TrueFault]:
     """Faults that act in some of these captures."""
-    return [f for f in truth.faults if f.capture is None or f.capture in given]
+    return [f for f in truth.faults if f.capture is None or f.capture in captures]
 
 
 def _cause(effect: Mapping[str, Any], faults: Sequence[TrueFault]) -> TrueCause:
@@ -170,11 +170,11 @@ def _names(text: str, capture: str | None, fault: TrueFault) -> bool:
     return kind == fault.kind and (not place or not fault.place or place == fault.place)
 
 
-def told_of(result: Result, truth: RealBench, given: Sequence[str]) -> tuple[Matter, ...]:
+def told_of(result: Result, truth: RealBench, captures: Sequence[str]) -> tuple[Matter, ...]:
     """Of each fault that acts in the captures given: how much it matters, and how it was told."""
     out = []
-    for fault in active(truth, given):
-        size = max((v for c, v in fault.matters.items() if c in (*given, VALIDATION)), default=0.0)
+    for fault in active(truth, captures):
+        size = max((v for c, v in fault.matters.items() if c in (*captures, VALIDATION)), default=0.0)
         outcome = "missed"
         for effect in result["effects"]:
             if _certainty(effect) == "unknown":

@@ -48,15 +48,15 @@ def fit_of_the_truth(
     return model.model_copy(update={"effects": (*model.effects, *effects)})
 
 
-def known_oracle(folder: Path, truth: RealBench, configs: Path, given: str) -> float:
+def known_oracle(folder: Path, truth: RealBench, configs: Path, capture_set: str) -> float:
     """Error of M / m00 of the validation sample after a fit of the true set; kept beside the truth once it is known."""
     away = folder / "truth" / truth.name
-    cache = away / f"oracle_{given}.json"
+    cache = away / f"oracle_{capture_set}.json"
     if cache.exists():
         return float(json.loads(cache.read_text(encoding="utf-8")))
-    captures = [folder / truth.name / f"{name}.h5" for name in GIVEN[given]]
+    captures = [folder / truth.name / f"{name}.h5" for name in GIVEN[capture_set]]
     declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
-    best = fit_of_the_truth(captures, declared, active(truth, GIVEN[given]))
+    best = fit_of_the_truth(captures, declared, active(truth, GIVEN[capture_set]))
     error = float("nan")
     if best is not None:
         error = error_of(away / f"{VALIDATION}.h5", best, np.load(away / f"{VALIDATION}.npy").astype(float))

@@ -18,17 +18,17 @@ from simulators.blind.real_bench import VALIDATION, RealBench
 
 
 def judge_bench(
-    folder: Path, truth: RealBench, configs: Path, given: str = "joint"
+    folder: Path, truth: RealBench, configs: Path, capture_set: str = "joint"
 ) -> tuple[BenchJudgement, dict[str, Any]]:
     """Diagnose the captures of one bench and judge the answer; also the result as `diagnose` writes it.
 
     Parameters
     ----------
     folder : as given to `make_bench`.
-    given : one of `GIVEN`.
+    capture_set : one of `GIVEN`.
     """
     declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
-    captures = [folder / truth.name / f"{name}.h5" for name in GIVEN[given]]
+    captures = [folder / truth.name / f"{name}.h5" for name in GIVEN[capture_set]]
     begun = time.perf_counter()
     result, corrected, corrects = _diagnosed(captures, declared)
     seconds = time.perf_counter() - begun
@@ -37,18 +37,18 @@ def judge_bench(
     judgement = BenchJudgement(
         name=truth.name,
         group=truth.group,
-        given=given,
+        given=capture_set,
         verdict=result["verdict"],
         seconds=round(seconds, 2),
         declared=_error(away, VALIDATION, declared),
         corrected=_error(away, VALIDATION, corrected),
         oracle=float("nan"),
-        own={name: (_error(away, name, declared), _error(away, name, corrected)) for name in GIVEN[given]},
+        own={name: (_error(away, name, declared), _error(away, name, corrected)) for name in GIVEN[capture_set]},
         coverage_pixels=covered.pixels,
         coverage_patches=covered.patches,
         written=corrects,
-        causes=names_of(result, truth, GIVEN[given]),
-        matters=told_of(result, truth, GIVEN[given]),
+        causes=names_of(result, truth, GIVEN[capture_set]),
+        matters=told_of(result, truth, GIVEN[capture_set]),
         wiring=wiring_of(result, truth),
         noise=str((result.get("noise") or {}).get("verdict", "")),
         left_out=tuple(result.get("left_out") or ()),

@@ -65,9 +65,9 @@ class DC2200Emulator(Emulator):
             self._error = _UNDEFINED
         return answer or None
 
-    def _led(self, part: str, led: int, rest: str) -> str | None:
+    def _led(self, part: str, led: int, tail: str) -> str | None:
         """Answer to a question, an empty text for a setting, None for what is not known."""
-        words = rest.split()
+        words = tail.split()
         setting_of = {"STATE": "STAT", "MODE": "MODE", "CBRIGHTNESS:BRIGHTNESS": "LEVEL"}
         # AMPLitude may be left out, or be cut to its capitals, as SCPI has it.
         header = re.sub(r":AMPL(ITUDE)?$", "", words[0].rstrip("?"))

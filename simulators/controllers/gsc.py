@@ -77,8 +77,8 @@ class GSCEmulator(Emulator):
         at_limit = "W" if stopped == [True, True] else "L" if stopped[0] else "M" if any(stopped) else "K"
         return ",".join((*places, "K" if self._taken else "X", at_limit, self._busy()))
 
-    def _chosen(self, which: str) -> list[int]:
-        indices = list(range(len(self.axes))) if which == "W" else [int(which) - 1]
+    def _chosen(self, selection: str) -> list[int]:
+        indices = list(range(len(self.axes))) if selection == "W" else [int(selection) - 1]
         return indices if max(indices) < len(self.axes) else []
 
     def _run(self, text: str) -> bool:
@@ -119,8 +119,8 @@ class GSCEmulator(Emulator):
         self._free = self.acknowledges and hold[2] == "0"
         return True
 
-    def _set_speeds(self, which: str, speeds: list[tuple[str, str, str]]) -> bool:
-        low, high = SPEEDS_OF_A_GSC_01 if self.acknowledges else SPEEDS.get(which, (1, 0))
+    def _set_speeds(self, selection: str, speeds: list[tuple[str, str, str]]) -> bool:
+        low, high = SPEEDS_OF_A_GSC_01 if self.acknowledges else SPEEDS.get(selection, (1, 0))
         numbers = [(int(start), int(top), int(ramp)) for start, top, ramp in speeds]
         if len(numbers) != len(self.axes) or not all(
             low <= start <= top <= high and ramp <= LONGEST_RAMP_MS for start, top, ramp in numbers
@@ -158,11 +158,11 @@ class GSCEmulator(Emulator):
                 axis.move_to(min(max(target, low), math.inf if axis.max_deg is None else axis.max_deg))
         return bool(nexts)
 
-    def _stop(self, which: str) -> bool:
-        chosen = self._chosen(which)
+    def _stop(self, selection: str) -> bool:
+        chosen = self._chosen(selection)
         for index in chosen:
             # While it homes, a GSC-02 obeys what is meant for all axes alone.
-            if which == "W" or self.acknowledges or not self.axes[index].homing:
+            if selection == "W" or self.acknowledges or not self.axes[index].homing:
                 self.axes[index].stop()
         self._next = {}
         return bool(chosen)

@@ -98,7 +98,7 @@ class ZaberDevice:
             "estop": self._stop,
             "warnings": self._warnings,
             "system": self._system,
-            "tools": lambda rest: " ".join(rest[1:]) or "0",
+            "tools": lambda names: " ".join(names[1:]) or "0",
         }
         if command not in handlers:
             raise Rejected("BADCOMMAND")

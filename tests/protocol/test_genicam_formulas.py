@@ -26,7 +26,7 @@ from simulators.camera.genicam.register import Register, RegisterMemory
     ],
 )
 def test_whole_numbers(text: str, value: int) -> None:
-    assert Formula(text, whole=True).value({"A": 0, "B": 5, "X.Max": 100}.__getitem__) == value
+    assert Formula(text, integer=True).value({"A": 0, "B": 5, "X.Max": 100}.__getitem__) == value
 
 
 @pytest.mark.parametrize(
@@ -34,7 +34,7 @@ def test_whole_numbers(text: str, value: int) -> None:
     [("7/2", 3.5), ("FROM*(2**BITS)", 12.0), ("ROUND(2.5)", 3.0), ("round(2.345, 1)", 2.3), ("SQRT(16)+PI-PI", 4.0)],
 )
 def test_real_numbers(text: str, value: float) -> None:
-    assert Formula(text, whole=False).value({"FROM": 3, "BITS": 2}.__getitem__) == pytest.approx(value)
+    assert Formula(text, integer=False).value({"FROM": 3, "BITS": 2}.__getitem__) == pytest.approx(value)
 
 
 NESTED = ("(" * 100 + "1" + ")" * 100, "-" * 100 + "1", "1+" * 40_000 + "1")
@@ -45,7 +45,7 @@ NESTED = ("(" * 100 + "1" + ")" * 100, "-" * 100 + "1", "1+" * 40_000 + "1")
 )
 def test_what_has_no_value_is_refused_at_once(text: str) -> None:
     with pytest.raises(FormulaError):
-        Formula(text, whole=True).value({}.__getitem__)
+        Formula(text, integer=True).value({}.__getitem__)
 
 
 def test_registers_keep_byte_order_sign_and_the_fields_beside_them() -> None:

@@ -98,7 +98,7 @@ class Formula:
     ----------
     text : str
         At most 64 KiB.
-    whole : bool
+    integer : bool
         True for those of whole numbers, in which a division cuts off what is behind the point.
 
     Raises
@@ -107,8 +107,8 @@ class Formula:
         It cannot be read.
     """
 
-    def __init__(self, text: str, *, whole: bool) -> None:
-        self._text, self._whole = text, whole
+    def __init__(self, text: str, *, integer: bool) -> None:
+        self._text, self._whole = text, integer
         if len(text) > _MOST_CHARACTERS:
             raise FormulaError(f"has {len(text):,} characters")
         self._tokens = self._split(text)
@@ -142,9 +142,9 @@ class Formula:
     def _next(self) -> str:
         return self._tokens[self._at] if self._at < len(self._tokens) else ""
 
-    def _take(self, wanted: str) -> None:
-        if self._next() != wanted:
-            raise FormulaError(f"{wanted!r} is expected and {self._next() or 'the end'!r} comes")
+    def _take(self, token: str) -> None:
+        if self._next() != token:
+            raise FormulaError(f"{token!r} is expected and {self._next() or 'the end'!r} comes")
         self._at += 1
 
     def _choice(self) -> Term:
@@ -187,11 +187,11 @@ class Formula:
         self._at += 1
         return _joined(_power, base, self._nested(self._unary))
 
-    def _nested(self, what: Callable[[], Term]) -> Term:
+    def _nested(self, parse: Callable[[], Term]) -> Term:
         self._depth += 1
         if self._depth > _DEEPEST:
             raise FormulaError(f"nested deeper than {_DEEPEST} levels")
-        term = what()
+        term = parse()
         self._depth -= 1
         return term
 

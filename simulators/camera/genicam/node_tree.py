@@ -132,24 +132,24 @@ class NodeTree:
         """The node that holds the value of a node: behind Integers, Enumerations, Converters and the like."""
         return list(self._way_down(name))[-1]
 
-    def limit(self, name: str, which: Limit) -> Number | None:
+    def limit(self, name: str, tag: Limit) -> Number | None:
         """Smallest or largest value, or step, as a program sees it; None where no node says."""
         for source in self._way_down(name):
             node = self.node(source)
-            reference = node.findtext(f"p{which}")
+            reference = node.findtext(f"p{tag}")
             if reference is not None:
                 return self.value(reference)
-            if node.find(which) is not None:
-                return self._number(source, node.findtext(which))
+            if node.find(tag) is not None:
+                return self._number(source, node.findtext(tag))
             if node.tag in _CONVERTERS:
                 return None
-        if node.tag in REGISTERS and which != "Inc":
-            return self.register(source).limits[which == "Max"]
+        if node.tag in REGISTERS and tag != "Inc":
+            return self.register(source).limits[tag == "Max"]
         return None
 
-    def limit_node(self, name: str, which: Limit) -> str | None:
+    def limit_node(self, name: str, tag: Limit) -> str | None:
         """The node that gives a limit of a feature; None where it is written down or not said."""
-        references = (self.node(source).findtext(f"p{which}") for source in self._way_down(name))
+        references = (self.node(source).findtext(f"p{tag}") for source in self._way_down(name))
         return next((reference for reference in references if reference is not None), None)
 
     def _way_down(self, name: str) -> Iterator[str]:
@@ -283,9 +283,9 @@ class NodeTree:
             raise self.error(name, f"stands at {address:#x}, outside what GigE Vision can address")
         return address
 
-    def _sum(self, name: str, place: Element, plain: str, other: str) -> int:
+    def _sum(self, name: str, place: Element, plain: str, indirect: str) -> int:
         total = sum(int(self._number(name, child.text)) for child in place.findall(plain))
-        return total + sum(int(self.value(child.text or "")) for child in place.findall(other))
+        return total + sum(int(self.value(child.text or "")) for child in place.findall(indirect))
 
     def _bits(self, name: str, node: Element, length: int, big: bool) -> tuple[int, int] | None:
         if node.tag not in ("MaskedIntReg", "StructEntry"):
@@ -325,23 +325,23 @@ class NodeTree:
             return self._number(name, node.findtext("ValueDefault"))
         return self._number(name, node.findtext("Value"))
 
-    def _calculated(self, name: str, which: str, known: dict[str, Number]) -> Number:
+    def _calculated(self, name: str, tag: str, variables: dict[str, Number]) -> Number:
         node = self.node(name)
         try:
-            formula = self._formula(name, node, which)
-            return formula.value(lambda variable: self._variable(name, node, known, variable))
+            formula = self._formula(name, node, tag)
+            return formula.value(lambda variable: self._variable(name, node, variables, variable))
         except FormulaError as why:
             raise self.error(name, f"has a formula that cannot be played: {why}") from why
 
-    def _formula(self, name: str, node: Element, which: str) -> Formula:
-        key = (name, which)
+    def _formula(self, name: str, node: Element, tag: str) -> Formula:
+        key = (name, tag)
         if key not in self._formulas:
-            self._formulas[key] = Formula(node.findtext(which) or "", whole=node.tag.startswith("Int"))
+            self._formulas[key] = Formula(node.findtext(tag) or "", integer=node.tag.startswith("Int"))
         return self._formulas[key]
 
-    def _variable(self, name: str, node: Element, known: dict[str, Number], variable: str) -> Number:
-        if variable in known:
-            return known[variable]
+    def _variable(self, name: str, node: Element, variables: dict[str, Number], variable: str) -> Number:
+        if variable in variables:
+            return variables[variable]
         for child in node:
             if child.get("Name") != variable:
                 continue
@@ -350,19 +350,19 @@ class NodeTree:
             if child.tag == "Constant":
                 return self._number(name, child.text)
             if child.tag == "Expression":
-                inner = Formula(child.text or "", whole=node.tag.startswith("Int"))
+                inner = Formula(child.text or "", integer=node.tag.startswith("Int"))
                 with self._passing(f"{name}.{variable}"):
-                    return inner.value(lambda other: self._variable(name, node, known, other))
+                    return inner.value(lambda operand: self._variable(name, node, variables, operand))
         raise KeyError(variable)
 
-    def _with_suffix(self, other: str, variable: str) -> Number:
+    def _with_suffix(self, reference: str, variable: str) -> Number:
         suffix = variable.rpartition(".")[2] if "." in variable else "Value"
         if suffix in ("Min", "Max", "Inc"):
-            limit = self.limit(other, suffix)  # type: ignore[arg-type]
+            limit = self.limit(reference, suffix)  # type: ignore[arg-type]
             if limit is None:
-                raise self.error(other, f"has no {suffix}, and a formula asks for it")
+                raise self.error(reference, f"has no {suffix}, and a formula asks for it")
             return limit
-        return self.value(other)
+        return self.value(reference)
 
     def _number(self, name: str, text: str | None) -> Number:
         text = (text or "").strip()

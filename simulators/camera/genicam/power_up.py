@@ -171,10 +171,10 @@ def _revive(nodes: NodeTree, name: str) -> None:
 
 def _unhide(nodes: NodeTree, name: str) -> None:
     for node in (nodes.node(name), *nodes.node(name).iter("EnumEntry")):
-        for condition, wanted in (("pIsImplemented", True), ("pIsAvailable", True), ("pIsLocked", False)):
+        for condition, state in (("pIsImplemented", True), ("pIsAvailable", True), ("pIsLocked", False)):
             reference = node.findtext(condition)
             if reference is not None:
-                _make(nodes, reference, lambda now, wanted=wanted: bool(now) == wanted, (_ALL_ONES, 1, 0))  # type: ignore[misc]
+                _make(nodes, reference, lambda now, state=state: bool(now) == state, (_ALL_ONES, 1, 0))  # type: ignore[misc]
 
 
 def _open_limits(nodes: NodeTree, name: str) -> None:

@@ -40,10 +40,10 @@ class RegisterMemory:
         duplicate._pages = {page: bytearray(content) for page, content in self._pages.items()}
         return duplicate
 
-    def restore(self, other: "RegisterMemory", but: Iterable[tuple[int, int]] = ()) -> None:
+    def restore(self, source: "RegisterMemory", but: Iterable[tuple[int, int]] = ()) -> None:
         """Take the bytes of another memory, except from each first address to before the last one of `but`."""
         pieces = [(first, self.read(first, last - first)) for first, last in but]
-        self._pages = other.copy()._pages
+        self._pages = source.copy()._pages
         for first, data in pieces:
             self.write(first, data)
 
