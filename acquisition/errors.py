@@ -50,7 +50,7 @@ class Unforeseen(RunFailed):
         self.trace = "".join(traceback.format_exception(error))
 
 
-def as_known(error: Exception) -> Exception:
+def as_run_error(error: Exception) -> Exception:
     """The error itself where it is one that a run may end with, else an `Unforeseen` that holds it."""
     return error if isinstance(error, AcquisitionError | DeviceError | ProcessError) else Unforeseen(error)
 

@@ -48,7 +48,7 @@ def change(name: str, factor: float) -> None:
     setattr(module, name, max(1, round(changed)) if isinstance(value, int) else changed)
 
 
-def judged(folder: Path, seeds: Sequence[int], capture_set: str) -> list[dict[str, Any]]:
+def judge_benches(folder: Path, seeds: Sequence[int], capture_set: str) -> list[dict[str, Any]]:
     """What became of each bench with the numbers as they are in this process."""
     from simulators.blind.bench_run import judge_bench
     from simulators.blind.real_bench import read_truth
@@ -70,7 +70,7 @@ def judged(folder: Path, seeds: Sequence[int], capture_set: str) -> list[dict[st
     return out
 
 
-def in_a_process_of_its_own(
+def judge_in_process(
     folder: Path, seeds: Sequence[int], capture_set: str, name: str = "", *, factor: float = 1.0
 ) -> list[dict[str, Any]]:
     """The same in a new process, which reads the changed number."""
@@ -92,12 +92,12 @@ def row(now: Sequence[dict[str, Any]], plain: Sequence[dict[str, Any]]) -> str:
 
 def lines(names: Sequence[str], folder: Path, seeds: Sequence[int], capture_set: str) -> Iterator[str]:
     """The table, a line as soon as it is known."""
-    plain = in_a_process_of_its_own(folder, seeds, capture_set)
+    plain = judge_in_process(folder, seeds, capture_set)
     yield f"{'number':28s} {'factor':>6s} {'M ratio':>8s} {'worse':>6s} {'right':>6s} {'wrong':>6s} {'verdicts':>9s}"
     yield f"{'as they are':28s} {'':6s} {row(plain, plain)}"
     for name in names:
         for factor in FACTORS:
-            changed = in_a_process_of_its_own(folder, seeds, capture_set, name, factor=factor)
+            changed = judge_in_process(folder, seeds, capture_set, name, factor=factor)
             yield f"{name:28s} {factor:6g} {row(changed, plain)}"
 
 
@@ -117,7 +117,7 @@ def main() -> None:
     if options.child:
         for name in options.names:
             change(name, options.factor)
-        print(json.dumps(judged(options.child, seeds, options.given)))
+        print(json.dumps(judge_benches(options.child, seeds, options.given)))
         return
     from simulators.blind.real_bench import make_bench
 

@@ -109,7 +109,7 @@ def page() -> str:
         parts.append(f"\n**Rig:** `{flow(fault.example())}`\n")
         if fault.hidden:
             parts.append(f"\n{wrapped(f'The default plan cannot show it: {fault.hidden}.')}\n")
-        if effect.kind in pictured():
+        if effect.kind in pictured_kinds():
             parts.append(f"\n![residual](images/effects/{effect.kind}.png)\n")
     parts.append(SURFACE)
     parts += [effect.lines(effects) for effect in described(reflectance_effects())]
@@ -198,7 +198,7 @@ def picture(fault: TypicalFault) -> Figure:
     return figure
 
 
-def pictured() -> list[str]:
+def pictured_kinds() -> list[str]:
     """Kinds with a picture."""
     return [kind for kind in sorted(FAULTS) if FAULTS[kind].mode == "drr" and not FAULTS[kind].hidden]
 
@@ -208,7 +208,7 @@ def main() -> None:
     RIG.write_text(faulty_rig(), encoding="utf-8")
     PAGE.write_text(page(), encoding="utf-8")
     PICTURES.mkdir(exist_ok=True)
-    for kind in pictured():
+    for kind in pictured_kinds():
         picture(FAULTS[kind]).savefig(PICTURES / f"{kind}.png", dpi=100)
 
 

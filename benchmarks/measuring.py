@@ -56,7 +56,7 @@ def seconds(work: Callable[[], object]) -> float:
     return time.perf_counter() - begin
 
 
-def spent(work: Callable[[], object]) -> Spent:
+def measure_cost(work: Callable[[], object]) -> Spent:
     """What one call cost; what it says itself if it says so."""
     wall, processor = time.perf_counter(), time.process_time()
     result = work()
@@ -107,7 +107,7 @@ def measure(task: Task, repeats: int, console: Console, busy: bool) -> bool:
     times: dict[str, list[float]] = {name: [] for name in task.peers}
     silent: dict[str, str] = {}
     for k in range(rounds):
-        costs.append(spent(task.ours))
+        costs.append(measure_cost(task.ours))
         for name, run in task.peers.items():
             if name in silent or (k >= SLOW_ROUNDS and times[name] and times[name][-1] > 1):
                 continue

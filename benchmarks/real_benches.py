@@ -24,11 +24,11 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def one(
+def judge_one(
     task: tuple[str, int, str], folder: Path, pixels: int, again: bool, *, oracle: bool, polarimeter: dict[str, Any]
 ) -> dict[str, Any]:
     """Judge one bench as (group, seed, captures given); from its file if it was judged before."""
-    from simulators.blind.bench_oracle import known_oracle
+    from simulators.blind.bench_oracle import read_oracle
     from simulators.blind.bench_run import judge_bench
     from simulators.blind.real_bench import Polarimeter, make_bench, read_truth
 
@@ -42,7 +42,7 @@ def one(
     )
     judgement, result = judge_bench(folder, truth, ROOT / "configs", capture_set)
     if oracle:
-        judgement = replace(judgement, oracle=known_oracle(folder, truth, ROOT / "configs", capture_set))
+        judgement = replace(judgement, oracle=read_oracle(folder, truth, ROOT / "configs", capture_set))
     cache.parent.mkdir(exist_ok=True)
     text = json.dumps({"judgement": asdict(judgement), "result": result}, indent=1)
     cache.with_suffix(".partial").write_text(text, encoding="utf-8")
@@ -87,7 +87,7 @@ def main() -> None:
         "oracle": not options.no_oracle,
         "polarimeter": polarimeter,
     }
-    run = partial(one, folder=options.folder, **more)
+    run = partial(judge_one, folder=options.folder, **more)
     judgements = []
     with ProcessPoolExecutor(options.workers) as workers:
         for k, raw in enumerate(workers.map(run, tasks), 1):

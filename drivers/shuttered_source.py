@@ -46,7 +46,7 @@ Config = TypeVar("Config", bound=ShutteredConfig)
 Source = TypeVar("Source", bound=ShutteredSource)
 
 
-def open_beside(
+def open_with_shutter(
     make: Callable[[Config, SerialLink, LightSource | None, LineRegistry], Source],
     config: Config,
     lines: LineRegistry,

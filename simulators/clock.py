@@ -41,7 +41,7 @@ class PatientClock:
         """Give a function to call every `BEAT_S`; the clock waits for the thread that does until the block ends."""
         key = object()
 
-        def here() -> None:
+        def check_in() -> None:
             with self._lock:
                 self._there[key] = True
                 self._go_on()
@@ -49,7 +49,7 @@ class PatientClock:
         with self._lock:
             self._there[key] = False
         try:
-            yield here
+            yield check_in
         finally:
             with self._lock:
                 del self._there[key]

@@ -16,10 +16,10 @@ from acquisition.screen.run_file import running_in
 from processing.commands.batch import natural
 from viewer.campaigns import STATUS, CampaignView, read_campaign
 from viewer.jobs import Jobs
-from viewer.library import Entry, Library, NotHere, made_from
+from viewer.library import Entry, Library, NotHere, inputs_of
 from viewer.notes import Note, notes_of
 from viewer.pages import file_of, pages_of
-from viewer.starting import campaign_files, resumed_with
+from viewer.starting import campaign_files, resume_preview
 
 #: Files on one page of a list.
 MOST = 50
@@ -143,7 +143,7 @@ def browse(request: Request) -> HTMLResponse:
         ),
         notes=notes,
         products=products,
-        sources=[made_from(e, entries, library.root) for e in products.entries],
+        sources=[inputs_of(e, entries, library.root) for e in products.entries],
         found=len(matches),
         total=len(entries),
         shown_at=pages.shown_at,
@@ -167,7 +167,7 @@ def campaign(request: Request) -> HTMLResponse:
         view=view,
         statuses=STATUS,
         bars=[asdict(bar) for bar in view.bars],
-        resumes=resumed_with(pages.library.root / view.name),
+        resumes=resume_preview(pages.library.root / view.name),
     )
 
 

@@ -71,7 +71,7 @@ def states_to_choose(capture: Capture) -> list[dict[str, Any]]:
     ]
 
 
-def asked_of(product: Product, query: Any) -> tuple[str, int]:
+def queried_map(product: Product, query: Any) -> tuple[str, int]:
     """Dataset or derived quantity, and the number of it."""
     return (query["name"], 0) if _is_derived(product, query) else named(product, query)
 
@@ -95,7 +95,7 @@ def difference(request: Request) -> Response:
             plane_a, plane_b = (product_values(product, query, window) for product in (first, second))
             shared = _shared_errors(first, second, query, window)
             systematic = _systematic_errors(first, second, query, window)
-            name, index = asked_of(first, query)
+            name, index = queried_map(first, query)
             units = "" if name == "mueller" or name in DERIVED else first.units(name)
             scale = scale_of("m00" if name == "mueller" and index == 0 else name, units, plane_a[0])
     else:
@@ -137,7 +137,7 @@ def _ends(counts: NDArray[np.float32]) -> tuple[float, float]:
 
 def product_values(product: Product, query: Any, window: Window) -> Measured:
     """What a request chooses of a product in a window, with its standard errors, NaN where they are not known."""
-    name, index = asked_of(product, query)
+    name, index = queried_map(product, query)
     if _is_derived(product, query):
         image = _image(product, window)
         values, gradient, *_ = _derived(image, name)
@@ -167,7 +167,7 @@ def _shared_errors(first: Product, second: Product, query: Any, window: Window) 
     captures = [[content_of(i) for i in every if i.get("role") == "capture"] for every in inputs]
     if captures[0] != captures[1] or not any(captures[0]):
         return None
-    name, index = asked_of(first, query)
+    name, index = queried_map(first, query)
     if not (name == "mueller" or _is_derived(first, query)) or not first.kind == second.kind == "mueller":
         return np.full(window.shape, np.nan)
     images = [_image(product, window) for product in (first, second)]
@@ -189,7 +189,7 @@ def _systematic_errors(first: Product, second: Product, query: Any, window: Wind
 
 def _shifts(product: Product, query: Any, window: Window) -> tuple[NDArray[np.floating] | None, NDArray[np.floating]]:
     """What each uncertain input of the instrument does to a map (D, rows, columns), if known, and their size."""
-    name, index = asked_of(product, query)
+    name, index = queried_map(product, query)
     moved = None
     if product.kind == "mueller" and (name == "mueller" or _is_derived(product, query)):
         systematic = Systematic.of_product(product)

@@ -12,7 +12,7 @@ from processing.reduction.counts_to_signal import saturation
 from processing.reports.capture_facts import facts_of, papers_of
 from processing.storage.captures.capture import Capture
 from viewer.diagnoses import Diagnoses
-from viewer.library import Entry, made_into
+from viewer.library import Entry, outputs_of
 from viewer.notes import Note, notes_of
 from viewer.pages import file_of, pages_of
 from viewer.planes import Window, sent
@@ -52,7 +52,7 @@ def capture(request: Request) -> HTMLResponse:
         warnings=warnings,
         states=states,
         first=next((k for k, role in enumerate(states["role"]) if role != "dark"), 0),
-        made=[(e, pages.shown_at(e)) for e in made_into(entry, entries, library.root)],
+        made=[(e, pages.shown_at(e)) for e in outputs_of(entry, entries, library.root)],
         others=others(entry, entries),
         writing=entry.status == "running",
         instruments=list(instrument_files(library)),

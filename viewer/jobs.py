@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from acquisition.screen.run_file import begun_ticks
+from acquisition.screen.run_file import start_ticks
 from drivers.log_process import start_appending
 from processing.doors import read_json
 from processing.errors import ProcessError
@@ -94,7 +94,7 @@ class Jobs:
                 # Ctrl-C for the application is not meant for a measurement that it has started.
                 start_new_session=True,
             )
-        job = PageJob(name, title, tuple(command), about, time.time(), process.pid, begun_ticks(process.pid))
+        job = PageJob(name, title, tuple(command), about, time.time(), process.pid, start_ticks(process.pid))
         (folder / "job.json").write_text(json.dumps(asdict(job)), encoding="utf-8")
         threading.Thread(target=self._wait, args=(process, output, folder), name=f"job {name}", daemon=True).start()
         return job
@@ -128,7 +128,7 @@ class Jobs:
 
     def running(self, job: PageJob) -> bool:
         """Whether its process is still there."""
-        return job.ticks is not None and begun_ticks(job.pid) == job.ticks
+        return job.ticks is not None and start_ticks(job.pid) == job.ticks
 
     def code(self, job: PageJob) -> int | None:
         """Its exit code; None while it runs, or where the application had ended before it did."""

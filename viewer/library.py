@@ -251,7 +251,7 @@ def _origin(steps: tuple[Step, ...]) -> tuple[tuple[dict[str, Any], ...], str]:
     return (steps[-1].inputs, steps[-1].name) if steps else ((), "")
 
 
-def made_from(entry: Entry, entries: list[Entry], root: Path) -> list[tuple[str, str, Entry | None]]:
+def inputs_of(entry: Entry, entries: list[Entry], root: Path) -> list[tuple[str, str, Entry | None]]:
     """Inputs of a file: role, path, and the file in the folder that it is."""
     return [
         (str(identity.get("role", "")), str(identity.get("path", "")), input_of(identity, entries, root))
@@ -280,9 +280,9 @@ def _content(path: Path, changed_s: float) -> str | None:
         return None
 
 
-def made_into(entry: Entry, entries: list[Entry], root: Path) -> list[Entry]:
+def outputs_of(entry: Entry, entries: list[Entry], root: Path) -> list[Entry]:
     """Files of the folder that were made from this one."""
-    return [e for e in entries if any(source is entry for _, _, source in made_from(e, entries, root))]
+    return [e for e in entries if any(source is entry for _, _, source in inputs_of(e, entries, root))]
 
 
 def _changed_s(folder: Path) -> float:

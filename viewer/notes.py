@@ -12,7 +12,7 @@ from processing.errors import ProcessError
 from processing.section import Section
 from viewer.library import Library
 from viewer.pages import fields_of, pages_of
-from viewer.side_files import read_kept, write_kept
+from viewer.side_files import read_side_file, write_side_file
 
 #: Name of the file, in the folder of the application's own files.
 FILE = "notes.json"
@@ -42,7 +42,7 @@ class _NotesFile(BaseModel):
 
 def notes_of(library: Library) -> dict[str, Note]:
     """Notes by the name of their file. Raises ProcessError for a damaged file."""
-    return read_kept(library, FILE, _NotesFile).files
+    return read_side_file(library, FILE, _NotesFile).files
 
 
 async def write_note(request: Request) -> JSONResponse:
@@ -62,5 +62,5 @@ def _write_note(library: Library, fields: dict[str, str]) -> JSONResponse:
         files = notes_of(library) | {name: note}
         if note == Note():
             del files[name]
-        write_kept(library, FILE, _NotesFile(files=files))
+        write_side_file(library, FILE, _NotesFile(files=files))
     return JSONResponse({"text": note.text, "tags": list(note.tags)})

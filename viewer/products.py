@@ -15,7 +15,7 @@ from processing.reports.fact_words import fact_lines
 from processing.storage.products.product import COMPANIONS, Product, is_lit
 from processing.storage.products.provenance import steps_text
 from viewer.frames import others
-from viewer.library import made_from, made_into
+from viewer.library import inputs_of, outputs_of
 from viewer.notes import Note, notes_of
 from viewer.pages import file_of, pages_of
 from viewer.planes import Window, sent
@@ -57,9 +57,9 @@ def product(request: Request) -> HTMLResponse:
         colours={name: steps(name) for name in ALL},
         sources=[
             (role, path, e, pages.shown_at(e) if e else None)
-            for role, path, e in made_from(entry, entries, library.root)
+            for role, path, e in inputs_of(entry, entries, library.root)
         ],
-        made=[(e, pages.shown_at(e)) for e in made_into(entry, entries, library.root)],
+        made=[(e, pages.shown_at(e)) for e in outputs_of(entry, entries, library.root)],
         others=others(entry, entries),
     )
 

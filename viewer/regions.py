@@ -25,13 +25,13 @@ from processing.section import Section
 from processing.storage.captures.capture import Capture
 from processing.storage.products.images import neighbour_correlation
 from processing.storage.products.product import Product, is_product
-from viewer.comparing import asked_of, capture_values, product_values, states_to_choose
+from viewer.comparing import capture_values, product_values, queried_map, states_to_choose
 from viewer.library import Library, NotHere
 from viewer.pages import fields_of, file_of, pages_of
 from viewer.planes import Window
 from viewer.probing import MOST, Region, finite
 from viewer.products import choices_of, units_words
-from viewer.side_files import read_kept, write_kept
+from viewer.side_files import read_side_file, write_side_file
 
 #: Name of the file, in the folder of the application's own files.
 FILE = "regions.json"
@@ -68,9 +68,9 @@ class _RegionsFile(BaseModel):
     regions: list[NamedRegion] = []
 
 
-def kept_regions(library: Library) -> list[NamedRegion]:
+def load_regions(library: Library) -> list[NamedRegion]:
     """The regions of a folder, in the order in which they were named. Raises ProcessError for a damaged file."""
-    return read_kept(library, FILE, _RegionsFile).regions
+    return read_side_file(library, FILE, _RegionsFile).regions
 
 
 async def keep_region(request: Request) -> JSONResponse:
@@ -87,8 +87,8 @@ def _keep_region(library: Library, fields: dict[str, str]) -> JSONResponse:
     columns, rows = ((part.start, part.stop) for part in (place.columns, place.rows))
     fresh = NamedRegion(name=name, columns=columns, rows=rows, image=shape)
     with _lock:
-        by_name = {region.name: region for region in kept_regions(library)} | {name: fresh}
-        write_kept(library, FILE, _RegionsFile(regions=list(by_name.values())))
+        by_name = {region.name: region for region in load_regions(library)} | {name: fresh}
+        write_side_file(library, FILE, _RegionsFile(regions=list(by_name.values())))
     return JSONResponse({"name": name})
 
 
@@ -100,10 +100,10 @@ async def drop_region(request: Request) -> JSONResponse:
 
 def _drop_region(library: Library, name: str) -> JSONResponse:
     with _lock:
-        saved = kept_regions(library)
+        saved = load_regions(library)
         if all(region.name != name for region in saved):
             raise NotHere(f"{name}: there is no such region")
-        write_kept(library, FILE, _RegionsFile(regions=[region for region in saved if region.name != name]))
+        write_side_file(library, FILE, _RegionsFile(regions=[region for region in saved if region.name != name]))
     return JSONResponse({"name": name})
 
 
@@ -137,7 +137,7 @@ def table(request: Request) -> Response:
 
 
 def _named_areas(library: Library, shape: tuple[int, int]) -> list[tuple[str, Region]]:
-    return [(region.name, area) for region in kept_regions(library) if (area := region.on(shape)) is not None]
+    return [(region.name, area) for region in load_regions(library) if (area := region.on(shape)) is not None]
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ class MeasuredImage:
                 counts, errors = capture_values(capture, query, window)
             return _Pixels(counts.astype(float), errors.astype(float), "count", None, alone)
         with Product(self._path) as product:
-            name, index = asked_of(product, query)
+            name, index = queried_map(product, query)
             values, errors = product_values(product, query, window)
             units = _units(product, name, index)
             systematic = None

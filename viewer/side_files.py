@@ -12,7 +12,7 @@ from viewer.library import OWN, Library
 Kept = TypeVar("Kept", bound=BaseModel)
 
 
-def read_kept(library: Library, file: str, kind: type[Kept]) -> Kept:
+def read_side_file(library: Library, file: str, kind: type[Kept]) -> Kept:
     """What a file holds; empty where there is none. Raises ProcessError for a damaged file."""
     path = library.root / OWN / file
     if not path.exists():
@@ -23,7 +23,7 @@ def read_kept(library: Library, file: str, kind: type[Kept]) -> Kept:
         raise ProcessError(f"{path} is damaged. Correct it, or move it away.") from error
 
 
-def write_kept(library: Library, file: str, content: BaseModel) -> None:
+def write_side_file(library: Library, file: str, content: BaseModel) -> None:
     """Replace a file. Raises ProcessError."""
     path = library.root / OWN / file
     try:

@@ -19,7 +19,7 @@ from viewer.library import Entry, NotHere
 from viewer.pages import Pages, pages_of
 from viewer.probing import Region
 from viewer.products import choices_of
-from viewer.regions import MeasuredImage, kept_regions
+from viewer.regions import MeasuredImage, load_regions
 
 #: What a curve runs over: the name of a column, and what it is.
 AXES = {"omega": "Ω", "nm": "wavelength", "time": "time", "sample": "sample"}
@@ -54,7 +54,7 @@ def stack(request: Request) -> HTMLResponse:
         words=query.get("q", ""),
         count=len(entries),
         choices=choices,
-        places=[MIDDLE, *(region.name for region in kept_regions(pages.library))],
+        places=[MIDDLE, *(region.name for region in load_regions(pages.library))],
         axes=AXES,
         # Without anything that differs these are repeats.
         over=most if varied[most] > 1 else "time",
@@ -102,7 +102,7 @@ def _place(entry: Entry) -> dict[str, Any]:
 def _points(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
     """A point for each product, and why others have none."""
     pages, query = pages_of(request), request.query_params
-    named = {area.name: area for area in kept_regions(pages.library)}
+    named = {area.name: area for area in load_regions(pages.library)}
     where = query.get("region", MIDDLE)
     if where != MIDDLE and where not in named:
         raise NotHere(f"{where}: there is no such region")

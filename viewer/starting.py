@@ -91,7 +91,7 @@ def resume_command(folder: Path) -> list[str] | None:
     return ["acquire", "--campaign", str(campaign), "--rig", str(rig), "--out", str(folder.parent), *more]
 
 
-def resumed_with(folder: Path) -> tuple[str, list[str]] | None:
+def resume_preview(folder: Path) -> tuple[str, list[str]] | None:
     """What a page would run to resume the campaign in a folder, as typed, and the commands that its rig file names.
 
     None where the campaign is not the user's own.

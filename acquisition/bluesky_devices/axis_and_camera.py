@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from acquisition.bluesky_devices.device import BlueskyDevice, Readings, data_key, readings
-from acquisition.bluesky_devices.frames_in_files import FRAME, Documents, asset_documents, in_file, write_frame
+from acquisition.bluesky_devices.frames_in_files import FRAME, Documents, asset_documents, external_key, write_frame
 from acquisition.bluesky_devices.status import MoveStatus, in_background
 from acquisition.errors import AcquisitionError
 from processing.storage.captures.schema import position_column
@@ -146,7 +146,7 @@ class CameraDevice(BlueskyDevice):
         shape = (settings.height or 0, settings.width or 0)
         keys = {f"{self.name}_mean": data_key("camera, mean of the frame", (), "count")}
         if self._writes_files:
-            keys[f"{self.name}_frame"] = in_file(data_key("camera, counts (1, row, column)", (1, *shape), "count"))
+            keys[f"{self.name}_frame"] = external_key(data_key("camera, counts (1, row, column)", (1, *shape), "count"))
         elif self.tells_frames:
             keys[f"{self.name}_frame"] = data_key("camera, counts (row, column)", shape, "count")
         return keys

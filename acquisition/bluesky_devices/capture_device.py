@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from acquisition.bluesky_devices.axis_and_camera import AxisDevice
 from acquisition.bluesky_devices.device import BlueskyDevice, Readings, data_key, readings
-from acquisition.bluesky_devices.frames_in_files import Documents, asset_documents, in_file
+from acquisition.bluesky_devices.frames_in_files import Documents, asset_documents, external_key
 from acquisition.bluesky_devices.settings import SettingDevice
 from acquisition.bluesky_devices.status import MoveStatus, in_background
 from acquisition.capture import session
@@ -184,7 +184,7 @@ class CaptureDevice(BlueskyDevice):
         keys |= {f"{self.name}_{c}": data_key(c, states, COLUMN_UNITS.get(c, "")) for c in COLUMNS}
         settings = self.rig.require_camera().settings
         frames = data_key("counts", (*states, 1, settings.height or 0, settings.width or 0), "count")
-        return keys | {f"{self.name}_frames": in_file(frames)}
+        return keys | {f"{self.name}_frames": external_key(frames)}
 
     def collect_asset_docs(self, index: int | None = None) -> Documents:
         """Where the frames of the last capture are; each file once."""

@@ -76,6 +76,6 @@ def asset_documents(key: str, path: Path, dataset: str, chunk: tuple[int, ...]) 
     )
 
 
-def in_file(key: dict[str, Any]) -> dict[str, Any]:
+def external_key(key: dict[str, Any]) -> dict[str, Any]:
     """A data key whose counts are found through a stream resource."""
     return key | {"external": "STREAM:", "dtype_numpy": "<u2"}

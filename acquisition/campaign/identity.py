@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from acquisition.campaign.plan import Campaign, CampaignCapture
-from acquisition.capture.identity import differences, files_of, lasting, plain, rig_content
+from acquisition.capture.identity import device_properties, differences, files_of, plain, rig_content
 from acquisition.capture.job import Job
 from acquisition.errors import Differs
 from acquisition.rig.config import RigConfig
@@ -48,7 +48,7 @@ def campaign_identity(
 
 def with_devices(identity: dict[str, Any], rig: Rig) -> dict[str, Any]:
     """The same with the devices of the rig, which is open."""
-    return {**identity, "device": lasting(rig.describe())}
+    return {**identity, "device": device_properties(rig.describe())}
 
 
 def require_same_campaign(folder: Path, now: dict[str, Any]) -> None:

@@ -23,10 +23,10 @@ from acquisition.capture.operator import Operator
 from acquisition.capture.plan import MeasurementPlan
 from acquisition.capture.writer import PARTIAL, bytes_needed, seal_whole
 from acquisition.disc import on_disc
-from acquisition.errors import Differs, InterlockOpened, PlanRefused, Stopped, Unforeseen, as_known
+from acquisition.errors import Differs, InterlockOpened, PlanRefused, Stopped, Unforeseen, as_run_error
 from acquisition.rig.config import RigConfig
-from acquisition.rig.continuous_rotation import states_deg, unwound
-from acquisition.rig.folded_angles import folded
+from acquisition.rig.continuous_rotation import states_deg, unwind
+from acquisition.rig.folded_angles import fold_angles
 from acquisition.rig.guarded import GUARD_LOG
 from acquisition.rig.interlocks import LOOK_S
 from acquisition.rig.open_rig import open_rig
@@ -72,10 +72,10 @@ def check_all(
     """Check every capture against the devices and the disc; nothing moves. Returns failures and passes alike."""
     planned = []
     pose: dict[str, float] = {}
-    start_deg = rig.where_once_homed()
+    start_deg = rig.pose_after_homing()
     results: dict[tuple[str, str], CheckResult] = {}
     for capture, job in jobs:
-        table = unwound(folded(job.table, rig), rig, start_deg)
+        table = unwind(fold_angles(job.table, rig), rig, start_deg)
         for check in check_with_devices(replace(job, table=table), rig, folder, start_deg):
             results.setdefault((check.what, check.found), check)
         start_deg |= states_deg(table)[-1]
@@ -148,7 +148,7 @@ class CampaignRun:
             self.folder.log("campaign stopped at once")
             raise
         except Exception as error:
-            failure = as_known(error)
+            failure = as_run_error(error)
             if self._rig is not None:
                 self._rig.call_for_help(failure)
             self.folder.log("campaign failed", error=str(failure), **_trace(failure))
@@ -177,7 +177,7 @@ class CampaignRun:
             except Stopped:
                 return None
             except Exception as unknown:
-                error, ended = as_known(unknown), True
+                error, ended = as_run_error(unknown), True
                 # A capture that got further was worth going on with: only tries without progress are counted.
                 failures = failures + 1 if self._states_done(capture) <= done else 1
                 self.folder.log(

@@ -191,7 +191,7 @@ def check_devices(
         else:
             ends = f"{column.min():g} to {column.max():g} {rig.config.axes[axis].unit}"
             checks.append(CheckResult(f"limits of {axis}", True, ends))
-    checks.append(_check_first_move(table, rig, state, rig.where_once_homed() if here_deg is None else here_deg))
+    checks.append(_check_first_move(table, rig, state, rig.pose_after_homing() if here_deg is None else here_deg))
     checks += _check_park(rig)
     if rig.source is not None and rig.source.interlock_open():
         checks.append(CheckResult("door", False, "the interlock circuit of the source is open; close it"))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from acquisition.capture.header import now
-from acquisition.capture.time_ledger import summed
+from acquisition.capture.time_ledger import add_summaries
 from acquisition.rig import alarms
 
 
@@ -23,7 +23,7 @@ def closing_record(records: Sequence[dict[str, Any]], last: dict[str, Any]) -> d
     closing["end_time"] = last["time"]
     closing["segments"] = last["segment"] + 1
     closing["segments_cut_off"] = killed
-    closing["ledger"] = summed([end["ledger"] for end in ends])
+    closing["ledger"] = add_summaries([end["ledger"] for end in ends])
     closing["messages"] = [text for end in ends for text in end["messages"]]
     closing["messages_dropped"] = sum(end["messages_dropped"] for end in ends)
     closing["evidence"] = [finding for end in ends for finding in end.get("evidence", [])]

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from acquisition.capture.job import Job
-from acquisition.rig.folded_angles import folded
+from acquisition.rig.folded_angles import fold_angles
 from acquisition.rig.rig import Rig
 
 #: Seconds that a frame takes to arrive and be written, where nothing overlaps it.
@@ -15,7 +15,7 @@ def capture_seconds(job: Job, rig: Rig, before_deg: Mapping[str, float] | None =
 
     An axis that may go on to the next turn is taken to go on by the shortest way up.
     """
-    table = folded(job.table, rig)
+    table = fold_angles(job.table, rig)
     first = {axis: float(column[0]) for axis, column in table.angles_deg.items()}
     start_deg = before_deg or {}
     seconds = sum(_move_s(rig, axis, angle - start_deg[axis]) for axis, angle in first.items() if axis in start_deg)

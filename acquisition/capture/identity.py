@@ -43,11 +43,11 @@ def identity_of(plan: MeasurementPlan, config: RigConfig, instrument: Instrument
         instrument=digest(plain(instrument)),
         software=f"umov {version('umov')}",
         files=files_of(config, plan.mode),
-        devices={} if rig is None else lasting(rig.describe()),
+        devices={} if rig is None else device_properties(rig.describe()),
     )
 
 
-def lasting(devices: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, str]]:
+def device_properties(devices: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, str]]:
     """The properties of devices that stay, as text."""
     return {name: {key: str(entry[key]) for key in LASTING if key in entry} for name, entry in devices.items()}
 
@@ -125,7 +125,7 @@ def require_same(capture: Capture, plan: MeasurementPlan, config: RigConfig, ins
 
 def devices_of(rig: Rig) -> tuple[dict[str, Any], dict[str, Any]]:
     """What lasts of the devices of a rig, and the settings of its camera."""
-    return lasting(rig.describe()), rig.require_camera().settings.model_dump(mode="json")
+    return device_properties(rig.describe()), rig.require_camera().settings.model_dump(mode="json")
 
 
 def require_same_devices(capture: Capture, devices: dict[str, Any], settings: dict[str, Any]) -> None:

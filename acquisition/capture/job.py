@@ -18,13 +18,13 @@ from acquisition.capture.checks import (
     standing_pose_deg,
 )
 from acquisition.capture.identity import require_same
-from acquisition.capture.mosaic_phase import seen_by_camera
+from acquisition.capture.mosaic_phase import match_mosaic
 from acquisition.capture.plan import AutoExposure, MeasurementPlan
 from acquisition.capture.writer import bytes_needed, check_space
 from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
-from acquisition.rig.folded_angles import folded
+from acquisition.rig.folded_angles import fold_angles
 from acquisition.rig.rig import Rig
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import StateTable
@@ -93,7 +93,7 @@ def check_with_devices(
     ----------
     here_deg : where the axes will stand before the capture; None for where they stand once they are homed.
     """
-    checks = check_devices(folded(job.table, rig), rig, job.first, here_deg)
+    checks = check_devices(fold_angles(job.table, rig), rig, job.first, here_deg)
     for exposure_s in np.unique(job.table.exposure_s)[::-1]:
         settings = rig.set_exposure(float(exposure_s), job.plan.repeats)
         read_back_s = settings.exposure_s or float(exposure_s)
@@ -127,7 +127,7 @@ def _check_space_in(folder: Path, needed: int) -> None:
 
 def _check_mosaic(instrument: InstrumentModel, rig: Rig) -> CheckResult:
     try:
-        mosaic = seen_by_camera(instrument, rig.require_camera()).mosaic or ()
+        mosaic = match_mosaic(instrument, rig.require_camera()).mosaic or ()
     except AcquisitionError as error:
         return CheckResult("mosaic", False, str(error))
     return CheckResult("mosaic", True, "from the top left: " + " / ".join(" ".join(line) for line in mosaic))

@@ -7,7 +7,7 @@ from processing.instrument.model import InstrumentModel
 _COLOURS = {"R": "red", "G": "green", "B": "blue"}
 
 
-def seen_by_camera(instrument: InstrumentModel, camera: Camera) -> InstrumentModel:
+def match_mosaic(instrument: InstrumentModel, camera: Camera) -> InstrumentModel:
     """The instrument with its mosaic as the camera's frames have it; the instrument file has that of the sensor.
 
     Raises

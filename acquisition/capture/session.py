@@ -12,16 +12,16 @@ from acquisition.capture.closing import closing_record, keep_end
 from acquisition.capture.header import capture_header, now, title_of
 from acquisition.capture.identity import devices_of, require_same_devices
 from acquisition.capture.job import Job, Result, frame_shape
-from acquisition.capture.mosaic_phase import seen_by_camera
+from acquisition.capture.mosaic_phase import match_mosaic
 from acquisition.capture.plan import ARM, AutoExposure
 from acquisition.capture.records import begin_record, end_record
 from acquisition.capture.runner import CaptureRunner, TooBright
 from acquisition.capture.writer import CaptureWriter, as_partial
 from acquisition.cleanup import run_all
 from acquisition.disc import on_disc
-from acquisition.errors import AcquisitionError, Stopped, as_known
-from acquisition.rig.continuous_rotation import turns_to, unwound
-from acquisition.rig.folded_angles import folded
+from acquisition.errors import AcquisitionError, Stopped, as_run_error
+from acquisition.rig.continuous_rotation import turns_to, unwind
+from acquisition.rig.folded_angles import fold_angles
 from acquisition.rig.interlocks import LightSoFar, light_so_far
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Mosaic, Observer
@@ -56,8 +56,8 @@ def take(
     place_sample(job, rig)
     job = replace(
         job,
-        table=unwound(folded(job.table, rig), rig),
-        instrument=seen_by_camera(job.instrument, rig.require_camera()),
+        table=unwind(fold_angles(job.table, rig), rig),
+        instrument=match_mosaic(job.instrument, rig.require_camera()),
     )
     header = capture_header(job.plan, job.rig, job.instrument, rig, seed=job.seed)
     begin = begin_record(job, rig, 0)
@@ -81,7 +81,7 @@ def resume(
     """
     _require_reference(rig, home)
     place_sample(job, rig)
-    job = replace(job, instrument=seen_by_camera(job.instrument, rig.require_camera()))
+    job = replace(job, instrument=match_mosaic(job.instrument, rig.require_camera()))
     lights = sum(role != "dark" for role in job.table.role)
     earlier = on_disc(
         f"read {partial}", _history, partial, frame_shape(rig), job.instrument.mosaic, devices_of(rig), lights=lights
@@ -164,7 +164,7 @@ def _run(
         mosaic=job.instrument.mosaic is not None,
         lit_darks=None if earlier is None else earlier.darks,
         rows=_rows(job),
-        turns={} if earlier is None else turns_to(job.table, rig, first, rig.where_once_homed(), preferred={}),
+        turns={} if earlier is None else turns_to(job.table, rig, first, rig.pose_after_homing(), preferred={}),
     )
     status: Status = "failed"
     failure: BaseException | None = None
@@ -185,7 +185,7 @@ def _run(
     except (KeyboardInterrupt, Stopped) as interrupt:
         status, failure = "aborted", interrupt
     except Exception as error:  # noqa: BLE001 - every end has its record
-        failure = as_known(error)
+        failure = as_run_error(error)
         if failure is not error:
             failure.__cause__ = error
     except BaseException as error:  # noqa: BLE001 - it is raised again once the end has its record
@@ -199,7 +199,7 @@ def _run(
     closing, path = _end_segment(runner, rig, status, failure)
     fault = run_all([("tell of the end", partial(observer.run_ended, status, closing)) for observer in watchers])
     if fault is not None and failure is None:
-        raise as_known(fault)
+        raise as_run_error(fault)
     if failure is not None:
         failure.add_note(f"States done so far are in {path}. Continue with: acquire --resume {path}")
         raise failure

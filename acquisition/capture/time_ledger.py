@@ -74,7 +74,7 @@ class TimeLedger:
         return _with_excess(summary)
 
 
-def summed(summaries: Sequence[Mapping[str, float]]) -> dict[str, float]:
+def add_summaries(summaries: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """The summary of several runs that took one capture."""
     total: dict[str, float] = {}
     for summary in summaries:

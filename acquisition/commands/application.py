@@ -95,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     Exit codes: 0 done, 1 the run failed, 2 bad input, 130 interrupted.
     """
-    from acquisition.errors import AcquisitionError, Differs, PlanRefused, Stopped, Unforeseen, as_known
+    from acquisition.errors import AcquisitionError, Differs, PlanRefused, Stopped, Unforeseen, as_run_error
     from drivers.errors import DeviceError
     from processing.errors import ProcessError
 
@@ -111,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt as error:
         _report(error, INTERRUPTED, "stopped at once; every axis was sent a stop")
     except Exception as error:  # noqa: BLE001 - the last boundary: a user reads a line, the traceback goes to a file
-        failure = as_known(error)
+        failure = as_run_error(error)
         if isinstance(failure, Unforeseen):
             from acquisition.rig import alarms
 

@@ -172,9 +172,9 @@ def acknowledge() -> None:
 def _load(rig: Path | None) -> RigConfig:
     from rich.console import Console
 
-    from acquisition.commands.single import given_rig, say_simulated
+    from acquisition.commands.single import load_user_rig, say_simulated
 
-    config = given_rig(rig or DEFAULT_RIG)
+    config = load_user_rig(rig or DEFAULT_RIG)
     say_simulated(Console(stderr=True), config)
     return config
 

@@ -33,7 +33,7 @@ class FoundPort:
     kind: str | None
 
 
-def found_ports() -> list[FoundPort]:
+def find_ports() -> list[FoundPort]:
     """Serial ports of USB adapters, by their lasting names where there are."""
     from serial.tools.list_ports import comports
 
@@ -49,7 +49,7 @@ def found_ports() -> list[FoundPort]:
     ]
 
 
-def found_cameras() -> tuple[list[dict[str, str]], str]:
+def find_cameras() -> tuple[list[dict[str, str]], str]:
     """Cameras that answer, and why there are none where none can be looked for."""
     from drivers.aravis_library import list_cameras, load_aravis
 
@@ -186,7 +186,7 @@ def write_rig(path: Path, configuration: Path | None = None) -> str:
         A file of that name exists, there is no such folder, or the configuration cannot be read.
     """
     require_new(path)
-    (cameras, why), ports = found_cameras(), found_ports()
+    (cameras, why), ports = find_cameras(), find_ports()
     text = rig_text(path.stem, cameras, ports, why_no_camera=why, configuration=configuration)
     write_new_text(path, text)
     return f"{path}: {len(cameras)} camera(s), {len(ports)} serial port(s). Fill in the axes, then acquire doctor --rig"

@@ -123,7 +123,7 @@ def _job(options: Options) -> tuple[Job, Path, bool]:
     _refuse_with_resume(options)
     with Capture(options.resume) as capture:
         plan = stored_plan(capture)
-        rig = given_rig(options.rig) if options.rig else own_rig_of(capture, options.as_new)
+        rig = load_user_rig(options.rig) if options.rig else own_rig_of(capture, options.as_new)
     if not options.as_new:
         return job_of(options.resume, rig), options.resume, True
     return prepare(plan, rig), options.resume.with_name(options.resume.name.removesuffix(PARTIAL)), False
@@ -145,7 +145,7 @@ def own_rig_of(capture: Capture, exactly: bool) -> RigConfig:
     alike = []
     for file in (*own_rigs(stored.name), DEFAULT_RIG):
         with contextlib.suppress(ProcessError):
-            rig = seeded(load_rig(file), stored.simulator.seed if stored.simulator else None)
+            rig = with_seed(load_rig(file), stored.simulator.seed if stored.simulator else None)
             if mode in rig.modes and rig_content(rig, mode) == rig_content(stored, mode):
                 return rig
             if file != DEFAULT_RIG:
@@ -160,7 +160,7 @@ def own_rig_of(capture: Capture, exactly: bool) -> RigConfig:
     )
 
 
-def given_rig(file: Path) -> RigConfig:
+def load_user_rig(file: Path) -> RigConfig:
     """Read a rig file that the user has given, and note that it is theirs. Raises ConfigError."""
     rig = load_rig(file)
     note_rig(file, rig.name)
@@ -206,10 +206,10 @@ def sample_of(name: str) -> Sample:
 
 def rig_of(options: Options) -> RigConfig:
     """The rig file, or the simulated rig."""
-    return seeded(given_rig(options.rig or DEFAULT_RIG), options.seed)
+    return with_seed(load_user_rig(options.rig or DEFAULT_RIG), options.seed)
 
 
-def seeded(rig: RigConfig, seed: int | None) -> RigConfig:
+def with_seed(rig: RigConfig, seed: int | None) -> RigConfig:
     """The rig with another seed of its simulated noise. Raises ConfigError for a real rig."""
     if seed is None:
         return rig

@@ -50,7 +50,7 @@ class Demo:
     folder: Path
     seconds: float
 
-    def found_for(self, fault: DrawnFault) -> tuple[FoundEffect, ...]:
+    def effects_for(self, fault: DrawnFault) -> tuple[FoundEffect, ...]:
         """Effects found for a drawn fault: by its name, or else with its name among the equal alternatives."""
         effects = self.judged.diagnosis.effects
         by_name = tuple(e for e in effects if e.kind in (fault.kind, *FAULTS[fault.kind].implies))

@@ -12,14 +12,14 @@ def cause_rows(demo: Demo) -> list[tuple[str, str]]:
     """Each built-in fault with the effect found for it, then the effects found for none of them."""
     rows, matched = [], list[FoundEffect]()
     for fault in demo.faults:
-        effects = demo.found_for(fault)
+        effects = demo.effects_for(fault)
         matched += effects
-        rows.append((f"{fault.kind}: {fault.size}", told(effects[0]) if effects else NOT_FOUND))
+        rows.append((f"{fault.kind}: {fault.size}", effect_line(effects[0]) if effects else NOT_FOUND))
     unmatched = [e for e in demo.judged.diagnosis.effects if not any(e is m for m in matched)]
-    return rows + [("nothing", told(e)) for e in unmatched]
+    return rows + [("nothing", effect_line(e)) for e in unmatched]
 
 
-def told(effect: FoundEffect) -> str:
+def effect_line(effect: FoundEffect) -> str:
     """Kind, values with their errors, and how sure the name is."""
     values, units = zip(*((p.told, p.unit) for p in effect.parameters.values()), strict=True)
     shown = ", ".join(values[:MOST_VALUES]) + (", ..." if len(values) > MOST_VALUES else "")

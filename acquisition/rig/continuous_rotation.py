@@ -15,7 +15,7 @@ from processing.instrument.states import StateTable
 UP_TO_DEG = 36_000.0
 
 
-def unwound(table: StateTable, rig: Rig, here_deg: Mapping[str, float] | None = None) -> StateTable:
+def unwind(table: StateTable, rig: Rig, here_deg: Mapping[str, float] | None = None) -> StateTable:
     """The table with its endless axes moved by whole turns, so that the first state lies ahead of where they stand.
 
     They come to every state from below then, and never turn back the way they came. Where the way ahead is forbidden,
@@ -25,7 +25,7 @@ def unwound(table: StateTable, rig: Rig, here_deg: Mapping[str, float] | None = 
     ----------
     here_deg : where the axes stand; None for where they stand once those without a reference are homed.
     """
-    start_deg = rig.where_once_homed() if here_deg is None else here_deg
+    start_deg = rig.pose_after_homing() if here_deg is None else here_deg
     ahead = {}
     for name in _endless(table, rig):
         if name in start_deg and np.ptp(table.angles_deg[name]) > 0:

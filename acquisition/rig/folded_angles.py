@@ -10,7 +10,7 @@ from drivers.axis_types import Limits
 from processing.instrument.states import StateTable
 
 
-def folded(table: StateTable, rig: Rig) -> StateTable:
+def fold_angles(table: StateTable, rig: Rig) -> StateTable:
     """The table with the targets of every axis in `fold_deg` inside its limits, each as near to the last as can be.
 
     A column that is inside already, or that no multiple brings inside, stays as it is.

@@ -24,14 +24,14 @@ def find_forbidden(
     taken to be anywhere. A rig that stands in a forbidden box, for instance after homing, may leave it with one axis
     at a time, by the nearer of the two edges that the limits of this axis let it reach.
     """
-    ranges = spanned(start_deg, end_deg)
+    ranges = swept_ranges(start_deg, end_deg)
     for box in boxes:
         if _inside(box, end_deg) or (touches(box, ranges) and not _leaves(box, start_deg, end_deg, limits or {})):
             return box
     return None
 
 
-def spanned(start_deg: Mapping[str, float], end_deg: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+def swept_ranges(start_deg: Mapping[str, float], end_deg: Mapping[str, float]) -> dict[str, tuple[float, float]]:
     """Lowest and highest angle of each axis during a move; an axis that only one mapping has stands there."""
     ranges = {}
     for axis in start_deg.keys() | end_deg.keys():
@@ -87,7 +87,7 @@ def _leaves(
         shortest = way <= other_way + EDGE_DEG or not _can_reach(limits.get(axis), low if up else high)
         if way <= EDGE_DEG or (moving == [axis] and shortest):
             outside[axis] = math.nextafter(high, math.inf) if up else math.nextafter(low, -math.inf)
-    return outside != start_deg and not touches(box, spanned(outside, end_deg))
+    return outside != start_deg and not touches(box, swept_ranges(outside, end_deg))
 
 
 def _can_reach(limits: Limits | None, edge_deg: float) -> bool:

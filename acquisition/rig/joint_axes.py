@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from acquisition.cleanup import run_all
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
-from acquisition.rig.way import Pose, concerned, find_homing_obstacle, find_obstacle, find_way
+from acquisition.rig.way import Pose, find_homing_obstacle, find_obstacle, find_way, restricted_axes
 from drivers.clock import Clock
 from drivers.errors import LimitError, MotionFailed
 from drivers.motion import Limits, Motion, MotionAxis, Position
@@ -52,7 +52,7 @@ class JointAxes:
         MotionFailed
             Every axis has been sent a stop by then.
         """
-        obstacle = find_homing_obstacle(self.config, names, self.where_known())
+        obstacle = find_homing_obstacle(self.config, names, self.known_pose())
         if obstacle is not None:
             raise AcquisitionError(f"{obstacle}. Nothing was moved.")
         for name in names:
@@ -80,7 +80,7 @@ class JointAxes:
         AcquisitionError
             There is no such way; nothing was moved.
         """
-        way = find_way(self.config, self.where_known(), targets_deg, by, limits=self.limits, first=first)
+        way = find_way(self.config, self.known_pose(), targets_deg, by, limits=self.limits, first=first)
         if way is None:
             # Says what is met.
             self._check_way(targets_deg)
@@ -120,10 +120,10 @@ class JointAxes:
         return self._find_obstacle(targets_deg) is None
 
     def _find_obstacle(self, targets_deg: Mapping[str, float]) -> str | None:
-        if not concerned(self.config) & targets_deg.keys():
+        if not restricted_axes(self.config) & targets_deg.keys():
             # Not even a position is read then: most moves are of rotators that nothing can hit.
             return None
-        pose = self.where_known()
+        pose = self.known_pose()
         return find_obstacle(self.config, pose, pose | dict(targets_deg), targets_deg, limits=self.limits)
 
     @property
@@ -131,13 +131,13 @@ class JointAxes:
         """Limits of every axis, the tighter ones of controller and rig file."""
         return {name: axis.limits for name, axis in self.axes.items()}
 
-    def where_known(self) -> dict[str, float]:
+    def known_pose(self) -> dict[str, float]:
         """Angles of the axes that forbidden poses and solids speak of, as far as they are known."""
         # Where an axis without a reference stands is not known, whatever it reads.
-        axes = {name: self.axes[name] for name in concerned(self.config) if name in self.axes}
+        axes = {name: self.axes[name] for name in restricted_axes(self.config) if name in self.axes}
         return {name: axis.read_position().deg for name, axis in axes.items() if axis.is_homed()}
 
-    def where_once_homed(self) -> dict[str, float]:
+    def pose_after_homing(self) -> dict[str, float]:
         """Angle of every axis after those without a reference have been homed, as far as the rig file tells.
 
         Where it does not, an axis is taken to end at its controller's zero.

@@ -9,7 +9,7 @@ from itertools import product
 from typing import TYPE_CHECKING, TypeAlias
 
 from acquisition.rig import clearance, forbidden_poses
-from acquisition.rig.forbidden_poses import EDGE_DEG, find_forbidden, spanned, touches
+from acquisition.rig.forbidden_poses import EDGE_DEG, find_forbidden, swept_ranges, touches
 from drivers.axis_types import Limits
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def find_obstacle(
     carriers = _carriers(rig)
     if rig.solids is None or (names is not None and not carriers & names):
         return None
-    clash = clearance.find_clash(rig.solids, spanned(start_deg, end_deg))
+    clash = clearance.find_clash(rig.solids, swept_ranges(start_deg, end_deg))
     return None if clash is None else clearance.describe(clash, rig.solids.margin_mm)
 
 
@@ -83,7 +83,7 @@ def find_way(
         legs = ((places, first_move), (places | first_move, second_move))
         if all(find_obstacle(rig, origin, origin | move, move, limits=limits) is None for origin, move in legs):
             return [first_move, second_move]
-    axes = [name for name in concerned(rig) if name in places]
+    axes = [name for name in restricted_axes(rig) if name in places]
     turning = [name for name in axes if abs(target_deg.get(name, places[name]) - places[name]) > EDGE_DEG]
     start = {name: places[name] for name in axes}
     end = start | {name: target_deg[name] for name in axes if name in target_deg}
@@ -120,7 +120,7 @@ def find_way(
     return [*turned, dict(target_deg)]
 
 
-def concerned(rig: RigSections) -> set[str]:
+def restricted_axes(rig: RigSections) -> set[str]:
     """Axes that forbidden poses or solids speak of."""
     return {axis for box in rig.forbidden for axis in box.ranges_deg} | _carriers(rig)
 

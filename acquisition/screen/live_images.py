@@ -17,7 +17,7 @@ def last_frame_png(pixels: NDArray[np.uint16], black: float, full_scale: int) ->
     """The frame, grey from black level to full scale (square root), saturated pixels red."""
     counts = np.arange(full_scale + 1, dtype=np.float32)
     tones = (np.sqrt(np.clip((counts - black) / (full_scale - black), 0, 1)) * 255).astype(np.uint8)
-    grey = tones[np.minimum(thinned(pixels), full_scale)]
+    grey = tones[np.minimum(thin_out(pixels), full_scale)]
     if int(pixels.max()) < full_scale:
         return png(grey)
     image = np.repeat(grey[..., np.newaxis], 3, axis=2)
@@ -34,7 +34,7 @@ class Modulation:
 
     def add(self, pixels: NDArray[np.uint16]) -> None:
         """One more state with light."""
-        thin = thinned(pixels)
+        thin = thin_out(pixels)
         if self._states == 0:
             self._low, self._high = thin.copy(), thin.copy()
         else:
@@ -59,7 +59,7 @@ def dolp_png(pixels: NDArray[np.uint16], mosaic: Mosaic, black: float) -> bytes:
     height, width = len(mosaic), len(mosaic[0])
     rows, columns = pixels.shape[0] // height * height, pixels.shape[1] // width * width
     channel = {
-        name: thinned(pixels[r:rows:height, c:columns:width]).astype(np.float32) - black
+        name: thin_out(pixels[r:rows:height, c:columns:width]).astype(np.float32) - black
         for r, line in enumerate(mosaic)
         for c, name in enumerate(line)
     }
@@ -79,7 +79,7 @@ def _map_png(values: NDArray[np.floating], light: NDArray[np.floating]) -> bytes
 
 def histogram(pixels: NDArray[np.uint16], full_scale: int) -> list[int]:
     """Pixels in 64 equal steps of the full scale; the last one ends with the saturated ones."""
-    counts, _ = np.histogram(thinned(pixels), bins=BINS, range=(0, full_scale + 1))
+    counts, _ = np.histogram(thin_out(pixels), bins=BINS, range=(0, full_scale + 1))
     return [int(n) for n in counts]
 
 
@@ -88,7 +88,7 @@ def _step(pixels: NDArray[np.uint16]) -> int:
     return max(1, -(-longest // LARGEST))
 
 
-def thinned(pixels: NDArray[np.uint16]) -> NDArray[np.uint16]:
+def thin_out(pixels: NDArray[np.uint16]) -> NDArray[np.uint16]:
     """Every n-th pixel, so that the picture fits the page; a view."""
     step = _step(pixels)
     return pixels[::step, ::step]

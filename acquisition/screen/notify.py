@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from acquisition.errors import as_known
+from acquisition.errors import as_run_error
 from acquisition.screen.observer import Observer
 from processing.section import Section
 
@@ -102,7 +102,7 @@ def notifying(config: NotifyConfig | None, subject: Path, simulated: bool) -> It
     try:
         yield notifier
     except Exception as error:
-        notifier.tell("failure", str(as_known(error)), pid=os.getpid())
+        notifier.tell("failure", str(as_run_error(error)), pid=os.getpid())
         raise
     finally:
         notifier.settle()

@@ -38,7 +38,7 @@ class RunFile(Observer):
         self._messages: deque[str] = deque(maxlen=MESSAGES)
         self._facts: dict[str, Any] = {
             "pid": os.getpid(),
-            "begun_ticks": begun_ticks(os.getpid()),
+            "begun_ticks": start_ticks(os.getpid()),
             "simulated": simulated,
             "title": "",
             "activity": "starting",
@@ -121,7 +121,7 @@ def _replace(path: Path, text: str) -> None:
     os.replace(new, path)
 
 
-def begun_ticks(pid: int) -> int | None:
+def start_ticks(pid: int) -> int | None:
     """When a process began, in the kernel's ticks: with its number it names it for good. None if it has ended."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
@@ -142,6 +142,6 @@ def _read(path: Path) -> dict[str, Any] | None:
     with contextlib.suppress(ProcessError):
         facts = read_json(path)
         if isinstance(facts, dict) and isinstance(pid := facts.get("pid"), int):
-            ticks = begun_ticks(pid)
+            ticks = start_ticks(pid)
             return facts if ticks is not None and ticks == facts.get("begun_ticks") else None
     return None

@@ -50,10 +50,10 @@ class Config(SessionReferenceConfig):
 
 
 class ShotStatus(NamedTuple):
-    """Answer to ``Q:``: pulses of each axis, whether the last command was taken, limit switches, whether it moves."""
+    """Answer to ``Q:``: pulses of each axis, last command accepted, limit switches, moving."""
 
     pulses: list[int]
-    taken: bool
+    accepted: bool
     at_limit: str
     busy: bool
 
@@ -90,11 +90,11 @@ class GSCAxis(SessionReferenceAxis):
         return ShotStatus([int(text) for text in pulses], acknowledgement == "K", at_limit, busy == "B")
 
     def _command(self, *commands: str) -> None:
-        """Send commands and ask after each whether it was taken; some controllers also answer OK or NG."""
+        """Send commands and ask after each whether it was accepted; some controllers also answer OK or NG."""
         for command in commands:
             with self._line.link.lock:
                 self._line.send(command)
-                is_accepted = self._status().taken
+                is_accepted = self._status().accepted
             if not is_accepted:
                 self._give_up_homing()
                 raise CommandRejected(

@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 from drivers.errors import DeviceError, WrongDevice
 from drivers.prompt_line import PromptLine
 from drivers.serial_link import LineRegistry, SerialLink
-from drivers.shuttered_source import ShutteredConfig, ShutteredSource, open_beside
+from drivers.shuttered_source import ShutteredConfig, ShutteredSource, open_with_shutter
 from drivers.source import LightSource, check_wavelengths
 from drivers.sources import sc10
 
@@ -118,4 +118,4 @@ class FilterWheel(ShutteredSource):
 
 def open(config: Config, lines: LineRegistry) -> FilterWheel:
     """Open the wheel, and the shutter where there is one; asks who they are and changes nothing."""
-    return open_beside(FilterWheel, config, lines, BAUDRATE)
+    return open_with_shutter(FilterWheel, config, lines, BAUDRATE)

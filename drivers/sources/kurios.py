@@ -16,7 +16,7 @@ from pydantic import Field
 from drivers.errors import DeviceError, WrongDevice
 from drivers.prompt_line import PromptLine
 from drivers.serial_link import LineRegistry, SerialLink
-from drivers.shuttered_source import ShutteredConfig, ShutteredSource, open_beside
+from drivers.shuttered_source import ShutteredConfig, ShutteredSource, open_with_shutter
 from drivers.source import LightSource
 from drivers.sources import sc10
 
@@ -114,4 +114,4 @@ class TunableFilter(ShutteredSource):
 
 def open(config: Config, lines: LineRegistry) -> TunableFilter:
     """Open the filter, and the shutter where there is one; asks who they are and changes nothing."""
-    return open_beside(TunableFilter, config, lines, BAUDRATE)
+    return open_with_shutter(TunableFilter, config, lines, BAUDRATE)

@@ -17,7 +17,7 @@ from processing.reflectance.base import ReflectanceModel, load_reflectance
 from processing.section import Section
 from processing.yaml_file import ConfigError, load_yaml
 from simulators.bench.scattering_laws import M00Law, Xi0Law, split_eigenvalues
-from simulators.bench.traced_surface import traced
+from simulators.bench.traced_surface import trace_surface
 
 BLOCK_PIXELS = 1 << 17
 
@@ -122,7 +122,7 @@ class Scene:
         self.spec = spec
         self.material = material
         #: What light meets: the material's physics by another way than the one that the processing takes.
-        self.optics = None if material is None else traced(material)
+        self.optics = None if material is None else trace_surface(material)
 
     @classmethod
     def load(cls, path: Path | str) -> "Scene":

@@ -60,7 +60,7 @@ class TracedSurface:
         return np.asarray(m / m[..., :1, :1])
 
 
-def traced(material: ReflectanceModel) -> ReflectanceModel:
+def trace_surface(material: ReflectanceModel) -> ReflectanceModel:
     """The traced surface of a material; one of another kind as it is."""
     if isinstance(material, first_surface.Model | polarized_diffuse.Model):
         return TracedSurface(material)

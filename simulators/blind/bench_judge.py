@@ -170,7 +170,7 @@ def _names(text: str, capture: str | None, fault: TrueFault) -> bool:
     return kind == fault.kind and (not place or not fault.place or place == fault.place)
 
 
-def told_of(result: Result, truth: RealBench, captures: Sequence[str]) -> tuple[Matter, ...]:
+def matters_of(result: Result, truth: RealBench, captures: Sequence[str]) -> tuple[Matter, ...]:
     """Of each fault that acts in the captures given: how much it matters, and how it was told."""
     out = []
     for fault in active(truth, captures):

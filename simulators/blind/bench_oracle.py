@@ -48,7 +48,7 @@ def fit_of_the_truth(
     return model.model_copy(update={"effects": (*model.effects, *effects)})
 
 
-def known_oracle(folder: Path, truth: RealBench, configs: Path, capture_set: str) -> float:
+def read_oracle(folder: Path, truth: RealBench, configs: Path, capture_set: str) -> float:
     """Error of M / m00 of the validation sample after a fit of the true set; kept beside the truth once it is known."""
     away = folder / "truth" / truth.name
     cache = away / f"oracle_{capture_set}.json"

@@ -12,7 +12,7 @@ import numpy as np
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument_file import write_instrument
 from processing.instrument.model import InstrumentModel
-from simulators.blind.bench_judge import GIVEN, BenchJudgement, names_of, told_of, wiring_of
+from simulators.blind.bench_judge import GIVEN, BenchJudgement, matters_of, names_of, wiring_of
 from simulators.blind.mueller_error import coverage_of, error_of
 from simulators.blind.real_bench import VALIDATION, RealBench
 
@@ -48,7 +48,7 @@ def judge_bench(
         coverage_patches=covered.patches,
         written=corrects,
         causes=names_of(result, truth, GIVEN[capture_set]),
-        matters=told_of(result, truth, GIVEN[capture_set]),
+        matters=matters_of(result, truth, GIVEN[capture_set]),
         wiring=wiring_of(result, truth),
         noise=str((result.get("noise") or {}).get("verdict", "")),
         left_out=tuple(result.get("left_out") or ()),

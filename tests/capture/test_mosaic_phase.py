@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from acquisition.capture.mosaic_phase import colours_of, seen_by_camera
+from acquisition.capture.mosaic_phase import colours_of, match_mosaic
 from acquisition.errors import AcquisitionError
 from drivers.camera import CameraSettings
 from processing.instrument.model import InstrumentModel
@@ -27,7 +27,7 @@ def instrument() -> InstrumentModel:
 def test_colours_follow_the_place_of_the_region(instrument, offset):
     x, y = offset
     camera = colour_camera(offset_x=x, offset_y=y)
-    assert seen_by_camera(instrument, camera) is instrument
+    assert match_mosaic(instrument, camera) is instrument
     first = {(0, 0): "red", (1, 0): "green", (0, 1): "green", (1, 1): "blue"}[x % 2, y % 2]
     assert colours_of(instrument, camera)[0][0] == first
 
@@ -45,7 +45,7 @@ def test_the_format_says_in_which_order_the_colours_lie(instrument, order):
 @pytest.mark.parametrize("setting", [{"reverse_x": True}, {"decimation": 2}, {"binning": 2}, {"offset_x": None}])
 def test_what_hides_the_colour_of_a_pixel_is_refused(instrument, setting):
     with pytest.raises(AcquisitionError, match=r"filter|mirrors"):
-        seen_by_camera(instrument, colour_camera(**setting))
+        match_mosaic(instrument, colour_camera(**setting))
 
 
 @pytest.mark.parametrize(
@@ -65,13 +65,13 @@ def test_analyzers_that_the_camera_names_are_those_of_the_instrument(told, decla
     )
     if wrong:
         with pytest.raises(AcquisitionError, match="identifies the analyzer of each count"):
-            seen_by_camera(stokes, camera)
+            match_mosaic(stokes, camera)
     else:
-        assert seen_by_camera(stokes, camera).mosaic == declared
+        assert match_mosaic(stokes, camera).mosaic == declared
 
 
 def test_a_polarization_sensor_is_no_plain_camera(instrument):
     camera = colour_camera()
     camera.describe = lambda: SimpleNamespace(colour=False, polarized=True, pixel_format="PolarizeMono8")
     with pytest.raises(AcquisitionError, match="PolarizeMono8 is that of a polarization sensor"):
-        seen_by_camera(instrument, camera)
+        match_mosaic(instrument, camera)

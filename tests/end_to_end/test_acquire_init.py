@@ -43,8 +43,8 @@ def test_a_camera_of_the_network_is_found_and_nothing_is_replaced(small_rig, acq
 
 
 def test_without_devices_it_says_so(monkeypatch, tmp_path):
-    monkeypatch.setattr(init, "found_cameras", lambda: ([], "no Aravis"))
-    monkeypatch.setattr(init, "found_ports", list)
+    monkeypatch.setattr(init, "find_cameras", lambda: ([], "no Aravis"))
+    monkeypatch.setattr(init, "find_ports", list)
     init.write_rig(tmp_path / "empty.yaml")
     assert "No camera answered (no Aravis)" in (tmp_path / "empty.yaml").read_text()
     with pytest.raises(ProcessError, match="exists"):

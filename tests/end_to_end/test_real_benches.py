@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel, SystematicError
-from simulators.blind.bench_judge import WIRING_WORDS, BenchJudgement, names_of, told_of, wiring_of
-from simulators.blind.bench_oracle import known_oracle
+from simulators.blind.bench_judge import WIRING_WORDS, BenchJudgement, matters_of, names_of, wiring_of
+from simulators.blind.bench_oracle import read_oracle
 from simulators.blind.bench_run import judge_bench
 from simulators.blind.bench_table import MATTERS, is_worse, reliability, sure_and_wrong, table
 from simulators.blind.mueller_error import Reduced, coverage_of, error_of
@@ -149,7 +149,7 @@ def test_fit_of_the_truth_is_far_better_than_the_declared_instrument(bench, conf
     away = folder / "truth" / truth.name
     declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
     exact = np.load(away / "validation.npy").astype(float)
-    assert known_oracle(folder, truth, configs, "joint") < Reduced.of(away / "validation.h5", declared).error(exact) / 3
+    assert read_oracle(folder, truth, configs, "joint") < Reduced.of(away / "validation.h5", declared).error(exact) / 3
 
 
 @pytest.mark.long
@@ -232,9 +232,9 @@ def test_a_name_is_right_at_its_place_and_in_its_capture():
     assert [c.right for c in causes] == [True, False, False, False, False]
     assert [c.right_set for c in causes] == [True, False, False, True, False]
     assert [c.certainty for c in causes] == ["sure", "sure", "likely", "one_of", "unknown"]
-    assert [m.told for m in told_of(result, truth, ("flat", "air"))] == ["named", "in a set"]
+    assert [m.told for m in matters_of(result, truth, ("flat", "air"))] == ["named", "in a set"]
     # What acts in another capture only is not asked of these.
-    assert [m.label for m in told_of(result, truth, ("sphere",))] == ["psg_extinction[psg_polarizer]"]
+    assert [m.label for m in matters_of(result, truth, ("sphere",))] == ["psg_extinction[psg_polarizer]"]
 
 
 def test_sentence_about_wiring_has_to_say_what_is_wrong():

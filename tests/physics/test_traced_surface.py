@@ -8,7 +8,7 @@ import pytest
 from processing.geometry.frames import ScatteringGeometry, unit
 from processing.reflectance import first_surface
 from simulators.bench.scene import Scene
-from simulators.bench.traced_surface import TracedSurface, traced
+from simulators.bench.traced_surface import TracedSurface, trace_surface
 
 
 @pytest.mark.parametrize("wavelength_nm", [451.0, 662.0])
@@ -16,9 +16,9 @@ from simulators.bench.traced_surface import TracedSurface, traced
 def test_the_paper_s_model_is_what_the_fields_do(configs: Path, omega_deg, wavelength_nm):
     scene = Scene.load(configs / "scenes/red_sphere.yaml")
     points = scene.object.geometry.at(omega_deg, 61, 61).points
-    found = traced(scene.material).mueller_jones(points, wavelength_nm)
+    found = trace_surface(scene.material).mueller_jones(points, wavelength_nm)
     assert np.abs(found - scene.material.mueller_jones(points, wavelength_nm)).max() < 1e-12
-    jones = traced(scene.material).jones(points, wavelength_nm)
+    jones = trace_surface(scene.material).jones(points, wavelength_nm)
     assert np.abs(jones - scene.material.jones(points, wavelength_nm)).max() < 1e-12
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from acquisition.screen.observer import StateReport
-from acquisition.screen.run_file import RunFile, begun_ticks, running_in
+from acquisition.screen.run_file import RunFile, running_in, start_ticks
 from drivers.motion import Position
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
@@ -59,7 +59,7 @@ def test_a_run_says_where_it_is_while_it_runs_and_nothing_afterwards(lab):
 def test_a_process_that_has_ended_or_another_with_its_number_runs_nothing(lab):
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
-    mine = {"pid": os.getpid(), "begun_ticks": begun_ticks(os.getpid()) - 1}
+    mine = {"pid": os.getpid(), "begun_ticks": start_ticks(os.getpid()) - 1}
     for name, facts in (("1", {"pid": ended.pid, "begun_ticks": 5}), ("2", mine), ("3", {"pid": "x"}), ("4", [])):
         (lab / f".run-{name}.json").write_text(json.dumps(facts))
     (lab / ".run-5.json").write_text("{half a")
