@@ -34,7 +34,7 @@ class LogProcess:
     """Appends text to a file; without one, or without a process to be had, it forgets it."""
 
     def __init__(self, path: Path | None) -> None:
-        self._kept = b""
+        self._pending = b""
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe = -1
@@ -48,21 +48,21 @@ class LogProcess:
     def add(self, text: str) -> None:
         """Add text."""
         with self._lock:
-            self._kept = (self._kept + text.encode())[-KEPT_BYTES:]
+            self._pending = (self._pending + text.encode())[-KEPT_BYTES:]
         self.flush()
 
     def flush(self) -> None:
         """Pass on what is kept, as far as it is taken now."""
         with self._lock, contextlib.suppress(OSError):
-            if self._process is not None and self._kept:
-                self._kept = self._kept[os.write(self._pipe, self._kept) :]
+            if self._process is not None and self._pending:
+                self._pending = self._pending[os.write(self._pipe, self._pending) :]
 
     def close(self) -> None:
         """Pass on what is kept and end, as far as the disc takes it within CLOSE_S."""
         process, end_s = self._process, time.monotonic() + CLOSE_S
         if process is None:
             return
-        while self._kept and process.poll() is None and time.monotonic() < end_s:
+        while self._pending and process.poll() is None and time.monotonic() < end_s:
             self.flush()
             time.sleep(0.005)
         with self._lock:

@@ -155,9 +155,9 @@ class NeutralFeatures:
     """
 
     def __init__(self, name: str, features: Features, user_set: str | None, exempt: Collection[str]) -> None:
-        self._name, self._features, self._user_set, self._kept = name, features, user_set, frozenset(exempt)
+        self._name, self._features, self._user_set, self._exempt = name, features, user_set, frozenset(exempt)
         self._is_loaded = False
-        self._known: list[tuple[str, Rule]] | None = None
+        self._rules: list[tuple[str, Rule]] | None = None
         self.remarks: list[str] = []
 
     def establish(self) -> None:
@@ -168,14 +168,14 @@ class NeutralFeatures:
         CameraLost
             The camera stopped answering.
         """
-        if self._known is None:
+        if self._rules is None:
             names = self._features.names()
             rules = ((name, rule_for(name)) for name in names)
-            self._known = [(name, rule) for name, rule in rules if rule is not None and name not in self._kept]
+            self._rules = [(name, rule) for name, rule in rules if rule is not None and name not in self._exempt]
         if not self._is_loaded:
             self.remarks = list(self._load())
             self._is_loaded = True
-        for name, rule in self._known:
+        for name, rule in self._rules:
             for _ in self._entries_of_selector(name):
                 self._set(name, rule)
 
@@ -242,7 +242,7 @@ class NeutralFeatures:
         names = [
             name
             for name in self._features.writable()
-            if rule_for(name) is None and name not in self._kept and not _NO_MATTER.match(name)
+            if rule_for(name) is None and name not in self._exempt and not _NO_MATTER.match(name)
         ]
         if names:
             yield f"{why}: {', '.join(names)} may be as another program set them"
@@ -311,7 +311,7 @@ class NeutralFeatures:
         return min(max(neutral, low), high)
 
     def _not_neutral(self) -> Iterator[tuple[str, Rule]]:
-        for name, rule in self._known or ():
+        for name, rule in self._rules or ():
             for _ in self._entries_of_selector(name):
                 if self._features.find((name,)) is None:
                     continue

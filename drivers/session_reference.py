@@ -29,11 +29,11 @@ class SessionReferenceAxis(MotionAxis):
         # Set by the driver when the device was seen in motion or told of its end.
         self._saw_motion = False
         self._rest_counts: float | None = None
-        self._lost = ""
+        self._loss = ""
 
     def _begin_homing(self) -> None:
         self._saw_motion = False
-        self._homing, self._referenced, self._lost = True, False, ""
+        self._homing, self._referenced, self._loss = True, False, ""
         self._rest_counts = None
 
     def _begin_moving(self) -> None:
@@ -56,7 +56,7 @@ class SessionReferenceAxis(MotionAxis):
             self._homing, self._referenced = False, self._homing_is_proved(counts, tolerance)
         if self._rest_counts is not None and abs(counts - self._rest_counts) > tolerance and self._referenced:
             self._referenced = False
-            self._lost = f"the resting position jumped from {self._rest_counts:g} to {counts:g} counts: home again"
+            self._loss = f"the resting position jumped from {self._rest_counts:g} to {counts:g} counts: home again"
         self._rest_counts = counts
         return self._referenced
 
@@ -68,8 +68,8 @@ class SessionReferenceAxis(MotionAxis):
         self._homing = False
 
     def _reference_warnings(self) -> list[str]:
-        if self._lost:
-            return [self._lost]
+        if self._loss:
+            return [self._loss]
         if self._referenced:
             return []
         return ["not homed in this session, and the device cannot tell whether it ever was"]

@@ -34,7 +34,7 @@ class PatientClock:
         self._counted_s = 0.0
         self._all_there_s = real_s()
         # Whether each thread that attends has been there since then.
-        self._there: dict[object, bool] = {}
+        self._is_present: dict[object, bool] = {}
 
     @contextmanager
     def attend(self) -> Iterator[Callable[[], None]]:
@@ -43,16 +43,16 @@ class PatientClock:
 
         def check_in() -> None:
             with self._lock:
-                self._there[key] = True
+                self._is_present[key] = True
                 self._go_on()
 
         with self._lock:
-            self._there[key] = False
+            self._is_present[key] = False
         try:
             yield check_in
         finally:
             with self._lock:
-                del self._there[key]
+                del self._is_present[key]
                 self._go_on()
 
     def now_s(self) -> float:
@@ -67,11 +67,11 @@ class PatientClock:
             time.sleep(left_s)
 
     def _go_on(self) -> None:
-        if all(self._there.values()):
+        if all(self._is_present.values()):
             real_s = self._real_s()
             self._counted_s += min(real_s - self._all_there_s, LONGEST_BEAT_S)
             self._all_there_s = real_s
-            self._there = dict.fromkeys(self._there, False)
+            self._is_present = dict.fromkeys(self._is_present, False)
 
 
 @cache

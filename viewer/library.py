@@ -87,7 +87,7 @@ class Library:
     """A folder; every file is opened once and again when it has changed, or while it is written."""
 
     root: Path
-    _known: dict[Path, tuple[tuple[int, int], Entry]] = field(default_factory=dict)
+    _cache: dict[Path, tuple[tuple[int, int], Entry]] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _read_anew: int = 0
 
@@ -153,13 +153,13 @@ class Library:
                 header = facts["header"] and CaptureHeader.model_validate(facts["header"])
                 lists = {key: tuple(facts[key]) for key in ("flags", "inputs")}
                 lists["states"] = facts["states"] and tuple(facts["states"])
-                self._known[self.root / name] = (tuple(stamp), Entry(**(facts | lists | {"header": header})))
+                self._cache[self.root / name] = (tuple(stamp), Entry(**(facts | lists | {"header": header})))
         except (OSError, ValueError, KeyError, TypeError):
-            self._known.clear()
+            self._cache.clear()
 
     def _save_index(self) -> None:
         files = {}
-        for stamp, entry in self._known.values():
+        for stamp, entry in self._cache.values():
             header = entry.header and entry.header.model_dump(mode="json", exclude=LONG)
             facts = {f.name: getattr(entry, f.name) for f in fields(entry)} | {"header": header}
             files[entry.name] = (stamp, facts)
@@ -188,8 +188,8 @@ class Library:
         except OSError:
             return None
         stamp = (stat.st_mtime_ns, stat.st_size)
-        if path in self._known and self._known[path][0] == stamp:
-            return self._known[path][1]
+        if path in self._cache and self._cache[path][0] == stamp:
+            return self._cache[path][1]
         self._read_anew += 1
         common: dict[str, Any] = {"name": self.name(path), "changed_s": stat.st_mtime, "size": stat.st_size}
         try:
@@ -201,9 +201,9 @@ class Library:
         # HDF5 answers for a file that another page has open with what it was then; its end changes neither size nor,
         # within one tick of the clock, the time.
         if entry.status == "running":
-            self._known.pop(path, None)
+            self._cache.pop(path, None)
         else:
-            self._known[path] = (stamp, entry)
+            self._cache[path] = (stamp, entry)
         return entry
 
 

@@ -26,7 +26,7 @@ class Operator:
         self._stop = stop
         self._yes = yes
         self._simulated = simulated
-        self._before: MeasurementPlan | None = None
+        self._previous_plan: MeasurementPlan | None = None
 
     def prepare(self, plan: MeasurementPlan, *, source_selects: bool = False) -> list[str]:
         """Have done what this capture needs and the one before did not; returns what was changed.
@@ -42,7 +42,7 @@ class Operator:
         Stopped
             Ctrl-C while waiting.
         """
-        before, self._before = self._before, plan
+        before, self._previous_plan = self._previous_plan, plan
         changes = []
         if before is None or before.sample != plan.sample:
             changes.append(f"place the sample: {plan.sample.name or plan.sample.kind}")

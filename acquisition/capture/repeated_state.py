@@ -33,7 +33,7 @@ class RepeatedState:
         self._state = 0
         self._blocks = np.zeros(0)
         # A plan of one pose repeats it with every state: the first change is told, not each.
-        self._told = False
+        self._is_reported = False
 
     def look(self, state: int, exposure_s: float, pose: tuple[float, ...], frame: NDArray[np.generic]) -> str | None:
         """What differs from the first light state, in words; None for any other pose, or if nothing does.
@@ -46,7 +46,7 @@ class RepeatedState:
         key = (exposure_s, *pose)
         if self._first is None:
             self._first, self._state, self._blocks = key, state, self._means(frame)
-        if key != self._first or state == self._state or self._told:
+        if key != self._first or state == self._state or self._is_reported:
             return None
         lit = self._blocks > LIT * max(float(self._blocks.max()), 1.0)
         if not lit.any():
@@ -56,7 +56,7 @@ class RepeatedState:
         pattern = float(np.std(blocks[lit] / self._blocks[lit]))
         if abs(change) < CHANGED and pattern < PATTERN:
             return None
-        self._told = True
+        self._is_reported = True
         return (
             f"state {state} repeats the pose of state {self._state}, and its light differs by {100 * change:+.1f} %, "
             f"from place to place by {100 * pattern:.1f} %: the lamp drifted, the sample moved, or an optic slipped "

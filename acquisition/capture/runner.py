@@ -100,8 +100,8 @@ class CaptureRunner:
         self.messages = Messages()
         self.interlocks = Interlocks(rig, self.warn, continue_after_interlock)
         self.poses_deg = states_deg(turned(table, turns or {}))
-        self._here: dict[str, float] = {}
-        self._at: int | None = None
+        self._pose_deg: dict[str, float] = {}
+        self._last_state: int | None = None
         self._light: bool | None = None
         self._light_losses = rig.light_losses()
         self._retakes: dict[int, int] = {}
@@ -124,8 +124,8 @@ class CaptureRunner:
             A device or the disc failed; every axis has been sent a stop.
         """
         self._pending = deque(pending)
-        self._here.clear()
-        self._at = None
+        self._pose_deg.clear()
+        self._last_state = None
         self._rested.clear()
         self._retakes.clear()
         exposed: _Exposed | None = None
@@ -214,14 +214,14 @@ class CaptureRunner:
 
     def _take(self, state: int, before: _Exposed | None) -> _Exposed | None:
         targets = self.poses_deg[state]
-        if self._at != state - 1 and not self.rig.is_free(targets):
+        if self._last_state != state - 1 and not self.rig.is_free(targets):
             # The way from one state to the next is free, as the plan's check has found; other ways may not be.
             if before is not None:
                 self._collect(before)
                 before = None
             self.go(state, "moving")
-        self._at = state
-        changed = {axis: target for axis, target in targets.items() if self._here.get(axis) != target}
+        self._last_state = state
+        changed = {axis: target for axis, target in targets.items() if self._pose_deg.get(axis) != target}
         # The longest move first: the others start while it is under way.
         changed = dict(sorted(changed.items(), key=lambda item: -self._move_s(*item)))
         motions = self.rig.start_moves(changed)
@@ -231,7 +231,7 @@ class CaptureRunner:
             self._collect(before)
         with self.ledger.time("moving"):
             positions = self.rig.wait(motions)
-        self._here.update(changed)
+        self._pose_deg.update(changed)
         self._set_light(self.table.role[state] != "dark")
         settle_s = self.rig.config.settle_s if changed else 0.0
         with self.ledger.time("settling"):
@@ -240,7 +240,7 @@ class CaptureRunner:
         return self._expose(state, targets, positions)
 
     def _move_s(self, axis: str, target_deg: float) -> float:
-        here_deg = self._here.get(axis)
+        here_deg = self._pose_deg.get(axis)
         return 0.0 if here_deg is None else self.rig.axes[axis].move_time_s(target_deg - here_deg)
 
     def _expose(self, state: int, targets: Mapping[str, float], moved: dict[str, Position]) -> _Exposed | None:

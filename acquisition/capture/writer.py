@@ -105,7 +105,7 @@ class CaptureWriter:
         self.on_failure: Callable[[AcquisitionError], None] | None = None
         self.on_blocked: Callable[[], None] | None = None
         self._state: Future[None] | None = None
-        self._since_s, self._by = 0.0, 0
+        self._since_s, self._thread_id = 0.0, 0
         self._ended = threading.Event()
         self._disc.call(f"open {path}", _open, path)
         self._watching = threading.Thread(target=self._watch, name="capture writer, watch", daemon=True)
@@ -147,7 +147,7 @@ class CaptureWriter:
         columns = {**record.columns, "segment": self.segment}
         self._since_s = self._clock.now_s()
         self._state = self._disc.submit(_write_state, self._place, record.state, positions, columns, frame=pixels)
-        self._by = threading.get_ident()
+        self._thread_id = threading.get_ident()
         self._state.add_done_callback(self._on_written)
         if self._state.done():
             self.settle()
@@ -155,7 +155,7 @@ class CaptureWriter:
     def _on_written(self, state: Future[None]) -> None:
         error = state.exception()
         # A state that has failed already is told of by `put` itself: a future swallows what this raises.
-        if error is not None and self.on_failure is not None and threading.get_ident() != self._by:
+        if error is not None and self.on_failure is not None and threading.get_ident() != self._thread_id:
             self.on_failure(self._failure(error))
 
     def set_exposure(self, exposure_s: NDArray[np.float64]) -> None:

@@ -69,7 +69,7 @@ class Guarding:
         self._ended = threading.Event()
         self._guard: subprocess.Popen[bytes] | None = None
         self._line: socket.socket | None = None
-        self._rest = b""
+        self._tail = b""
         self._heart = threading.Thread(target=self._live, name="heartbeat", daemon=True)
         self._heart.start()
 
@@ -159,7 +159,7 @@ class Guarding:
             )
         finally:
             theirs.close()
-        self._line, self._rest = ours, b""
+        self._line, self._tail = ours, b""
         socket.send_fds(ours, [b"\0"], list(self._ports.values()))
         hello = {
             "rig": dump_yaml(self._config),
@@ -239,7 +239,7 @@ class Guarding:
             data = b""
         if not data:
             return None
-        *lines, self._rest = (self._rest + data).split(b"\n")
+        *lines, self._tail = (self._tail + data).split(b"\n")
         return [json.loads(line) for line in lines]
 
     def _say(self, message: dict[str, object]) -> None:

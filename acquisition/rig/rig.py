@@ -84,7 +84,7 @@ class Rig(JointAxes):
         self.last_frame: NDArray[np.uint16] | None = None
         self.source: WatchedSource | None = None
         self._camera_entry = config.camera
-        self._asked: CameraSettings | None = None
+        self._camera_settings: CameraSettings | None = None
         self._read_back = CameraSettings()
         self._with_camera = with_camera
         self._ask = ask
@@ -319,15 +319,15 @@ class Rig(JointAxes):
         """Set exposure and averaging, unless they are set so already; returns the settings as read back."""
         # The trigger is that of the rig file.
         settings = CameraSettings(exposure_s=exposure_s, frame_average=repeats)
-        if self._asked != settings:
-            self._asked = None
+        if self._camera_settings != settings:
+            self._camera_settings = None
             self._read_back = self.require_camera().configure(settings)
-            self._asked = settings
+            self._camera_settings = settings
         return self._read_back
 
     def forget_exposure(self) -> None:
         """Set the exposure anew with the next frame: the camera has another one than it was set to."""
-        self._asked = None
+        self._camera_settings = None
 
     def require_camera(self) -> Camera:
         """The camera; AcquisitionError if the rig was opened without."""

@@ -121,7 +121,7 @@ class APTAxis(MotionAxis):
         super().__init__(name, config, lines.clock)
         self.config: Config = config
         self._line, self._lines = line, lines
-        self._to = UNIT if config.bay is None else BAY + config.bay - 1
+        self._destination = UNIT if config.bay is None else BAY + config.bay - 1
         # Periodic messages of an earlier program would only disturb; this moves nothing.
         self._tell(0x0012)
         information = short_message(0x0005, to=UNIT if config.bay is None else RACK)
@@ -158,14 +158,14 @@ class APTAxis(MotionAxis):
             model=model,
             serial_number=str(serial_number),
             firmware=".".join(str(part) for part in reversed(info[14:17])),
-            address=f"{self._to:#04x}",
+            address=f"{self._destination:#04x}",
         )
 
     def _tell(self, message_id: int, first: int = 0, second: int = 0) -> None:
-        self._line.link.write(short_message(message_id, first, second, self._to))
+        self._line.link.write(short_message(message_id, first, second, self._destination))
 
     def _ask(self, request_id: int, reply_id: int) -> bytes:
-        return self._line.ask(short_message(request_id, 1, to=self._to), reply_id)
+        return self._line.ask(short_message(request_id, 1, to=self._destination), reply_id)
 
     def _find_scale(self, model: str, stage: int) -> StageScale:
         if self.config.stage is not None:
@@ -207,7 +207,7 @@ class APTAxis(MotionAxis):
 
     def _do_start_move(self, counts: float) -> None:
         self._enable()
-        self._line.link.write(long_message(0x0453, struct.pack("<Hi", 1, round(counts)), self._to))
+        self._line.link.write(long_message(0x0453, struct.pack("<Hi", 1, round(counts)), self._destination))
 
     def _do_start_home(self) -> None:
         """Start homing and wait until the unit says that it homes; the old `homed` bit may still stand till then."""
@@ -215,7 +215,7 @@ class APTAxis(MotionAxis):
         if self.config.home_speed_deg_s is not None:
             velocity = round(self.config.home_speed_deg_s * self._scale.velocity)
             parameters = struct.pack("<HHHii", 1, direction, switch, velocity, offset)
-            self._line.link.write(long_message(0x0440, parameters, self._to))
+            self._line.link.write(long_message(0x0440, parameters, self._destination))
         if velocity <= 0:
             raise CommandRejected(
                 f"axis {self.name}, home",

@@ -168,7 +168,7 @@ class ElliptecAxis(SessionReferenceAxis):
             raise ReplyError(f"axis {name}, identify", f"travel {travel}, pulses {pulses}", "Is it a rotation mount?")
         if module in (7, 10, 17, 20):
             raise WrongDevice(f"axis {name}, identify", f"ELL{module} is a linear stage", "Correct the rig file")
-        self._known = module in _ROTARY
+        self._is_listed = module in _ROTARY
         # The field is pulses for the whole travel of a turn, whatever the manual calls it.
         self.counts_per_deg = pulses / travel
         velocity = int(agreed(lambda: line.ask(self._address, "gv", "GV", 2)), 16)
@@ -261,7 +261,7 @@ class ElliptecAxis(SessionReferenceAxis):
 
     def _do_warnings(self) -> list[str]:
         words = self._reference_warnings()
-        if not self._known:
+        if not self._is_listed:
             words.append(f"model {self._identity.model} is not known here, treated as ELL14")
         return words
 

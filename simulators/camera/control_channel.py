@@ -67,7 +67,7 @@ class ControlChannel:
     def __init__(self, device: RegisterDevice) -> None:
         self._device = device
         self._socket: socket.socket | None = None
-        self._heard: list[socket.socket] = []
+        self._listeners: list[socket.socket] = []
         self._thread: threading.Thread | None = None
         self._controller: _Address | None = None
         self._heard_s = 0.0
@@ -81,7 +81,7 @@ class ControlChannel:
             self._socket.close()
             raise
         # A program that looks for cameras asks everybody, and that arrives at other addresses than the camera's own.
-        self._heard = [self._socket, *_broadcast_sockets(address)]
+        self._listeners = [self._socket, *_broadcast_sockets(address)]
         self._controller = None
         self._thread = threading.Thread(target=self._serve, args=(self._socket,), name=f"camera {address}", daemon=True)
         self._thread.start()
@@ -91,7 +91,7 @@ class ControlChannel:
         channel, self._socket = self._socket, None
         if channel is not None and self._thread is not None:
             self._thread.join()
-            for heard in self._heard:
+            for heard in self._listeners:
                 heard.close()
 
     def _serve(self, channel: socket.socket) -> None:
@@ -99,7 +99,7 @@ class ControlChannel:
             # What waits was sent while this thread had no turn: its sender was not silent.
             if not select.select([channel], [], [], 0)[0]:
                 self._release_silent_controller()
-            for heard in select.select(self._heard, [], [], _SLICE_S)[0]:
+            for heard in select.select(self._listeners, [], [], _SLICE_S)[0]:
                 # The port of somebody who is gone; the next packet is another's. A packet that is too short for what it
                 # says is nobody's command.
                 with contextlib.suppress(struct.error, OSError):

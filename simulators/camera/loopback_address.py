@@ -36,7 +36,7 @@ class LoopbackAddress:
     def __init__(self, address: str, elsewhere: bool = False) -> None:
         self.address = address
         self._elsewhere = elsewhere
-        self._held: socket.socket | None = None
+        self._socket: socket.socket | None = None
 
     def take(self, wait_s: float) -> None:
         """Wait until the address is free and hold it; harmless if it is held already.
@@ -46,7 +46,7 @@ class LoopbackAddress:
         CameraError
             No interface has the address, or a camera kept it for longer than `wait_s`.
         """
-        if self._held is not None:
+        if self._socket is not None:
             return
         addresses = loopback_addresses()
         # Linux binds any 127.x.x.x, but a driver that looks for cameras asks at the addresses of interfaces.
@@ -58,7 +58,7 @@ class LoopbackAddress:
             fallbacks = [entry for entry in addresses if entry != self.address] if self._elsewhere else []
             for address in (self.address, *fallbacks):
                 if (held := self._bound(address)) is not None:
-                    self.address, self._held = address, held
+                    self.address, self._socket = address, held
                     return
             if time.monotonic() > deadline_s:
                 raise self._error(
@@ -85,7 +85,7 @@ class LoopbackAddress:
 
     def release(self) -> None:
         """Let the next camera have the address; releasing twice is harmless."""
-        held, self._held = self._held, None
+        held, self._socket = self._socket, None
         if held is not None:
             held.close()
 

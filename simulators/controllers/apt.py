@@ -289,9 +289,9 @@ class APTEmulator(Emulator):
         first = BAY if model.is_rack else UNIT
         self.units = [APTUnit(model, axis, first + index, self._reply) for index, axis in enumerate(axes)]
         # A single unit also listens to the addresses of a rack's first bay.
-        self._at = {unit.address: unit for unit in self.units}
+        self._unit_at = {unit.address: unit for unit in self.units}
         if not model.is_rack:
-            self._at[BAY] = self.units[0]
+            self._unit_at[BAY] = self.units[0]
         self._buffer = bytearray()
 
     def _do_receive(self, data: bytes) -> None:
@@ -299,7 +299,7 @@ class APTEmulator(Emulator):
         while len(self._buffer) >= 6:
             message_id, length, destination, source = struct.unpack_from("<HHBB", self._buffer)
             is_long = bool(destination & 0x80)
-            if destination & 0x7F not in (RACK, *self._at) or source != HOST or (is_long and length > 255):
+            if destination & 0x7F not in (RACK, *self._unit_at) or source != HOST or (is_long and length > 255):
                 del self._buffer[0]
                 continue
             total = 6 + (length if is_long else 0)
@@ -308,8 +308,8 @@ class APTEmulator(Emulator):
             message = bytes(self._buffer[:total])
             del self._buffer[:total]
             self._apply_faults()
-            if destination & 0x7F in self._at:
-                self._at[destination & 0x7F].command(message_id, message)
+            if destination & 0x7F in self._unit_at:
+                self._unit_at[destination & 0x7F].command(message_id, message)
             elif self.model.is_rack:
                 self._rack(message_id, message)
 

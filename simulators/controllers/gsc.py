@@ -39,7 +39,7 @@ class GSCEmulator(Emulator):
         super().__init__(axes, clock, faults)
         self.acknowledges = acknowledges
         self._lines = LineCollector()
-        self._taken = True
+        self._is_accepted = True
         self._free = False
         # What the next drive does: for each axis a target in degrees, or a direction of jogging.
         self._next: dict[int, float | str] = {}
@@ -62,9 +62,9 @@ class GSCEmulator(Emulator):
         if text in answers:
             self._reply(f"{answers[text]}\r\n".encode())
             return
-        self._taken = self._run(text)
+        self._is_accepted = self._run(text)
         if self.acknowledges:
-            self._reply(b"OK\r\n" if self._taken else b"NG\r\n")
+            self._reply(b"OK\r\n" if self._is_accepted else b"NG\r\n")
 
     def _busy(self) -> str:
         return "B" if any(axis.is_moving() for axis in self.axes) else "R"
@@ -75,7 +75,7 @@ class GSCEmulator(Emulator):
         places = [f"{'-' if count < 0 else ' '}{abs(count):9d}" for count in pulses]
         stopped = [not axis.is_moving() and axis.position_deg() in (axis.min_deg, axis.max_deg) for axis in self.axes]
         at_limit = "W" if stopped == [True, True] else "L" if stopped[0] else "M" if any(stopped) else "K"
-        return ",".join((*places, "K" if self._taken else "X", at_limit, self._busy()))
+        return ",".join((*places, "K" if self._is_accepted else "X", at_limit, self._busy()))
 
     def _chosen(self, selection: str) -> list[int]:
         indices = list(range(len(self.axes))) if selection == "W" else [int(selection) - 1]

@@ -32,7 +32,7 @@ class OWISEmulator(Emulator):
         self._ready = [False] * len(axes)
         self._relative = [False] * len(axes)
         self._targets = [0] * len(axes)
-        self._kept: dict[str, int] = {}
+        self._memory: dict[str, int] = {}
 
     def _do_receive(self, data: bytes) -> None:
         for line in self._lines.lines(data):
@@ -70,7 +70,7 @@ class OWISEmulator(Emulator):
         }
         if question[1] in questions:
             return str(questions[question[1]]())
-        return str(self._kept[text[1:]]) if text[1:] in self._kept else None
+        return str(self._memory[text[1:]]) if text[1:] in self._memory else None
 
     def _obey(self, text: str) -> None:
         """Do a command; none is answered, and what is wrong is passed over."""
@@ -97,7 +97,7 @@ class OWISEmulator(Emulator):
             case "CNT", True if not moves:
                 axis.call_position(int(value) / COUNTS_PER_DEG)
             case _, True:
-                self._kept[order[1] + order[2]] = int(value)
+                self._memory[order[1] + order[2]] = int(value)
 
     def _go(self, index: int) -> None:
         counts = self._targets[index] + (self._counts(index) if self._relative[index] else 0)

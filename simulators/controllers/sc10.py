@@ -30,7 +30,7 @@ class SC10Emulator(Emulator):
         self._enabled = False
         self._changed_s = -1e9
         # Where a blade that sticks stays.
-        self._held: bool | None = None
+        self._stuck: bool | None = None
         # Times in milliseconds, repeats, trigger and speed of the line: kept, and without effect here.
         self._numbers = {"open": 1000, "shut": 1000, "rep": 1, "trig": 0, "baud": 0, "xto": 0}
         self._buffer = bytearray()
@@ -53,16 +53,16 @@ class SC10Emulator(Emulator):
                 self._changed_s = self.clock.now_s()
 
     def _blade_open(self) -> bool:
-        if self._held is not None:
-            return self._held
+        if self._stuck is not None:
+            return self._stuck
         arrived = self.clock.now_s() >= self._changed_s + self.blade_s
         return self._enabled if arrived else not self._enabled
 
     def _stick(self, sticks: bool) -> None:
         if not sticks:
-            self._held = None
-        elif self._held is None:
-            self._held = self._blade_open()
+            self._stuck = None
+        elif self._stuck is None:
+            self._stuck = self._blade_open()
 
     def _do_receive(self, data: bytes) -> None:
         self._buffer += data

@@ -72,7 +72,7 @@ class StandaEmulator(Emulator):
         self._zero_deg = axis.mechanical_deg()
         self._buffer = bytearray()
         self._last_byte_s = 0.0
-        self._kept = {name: bytes(size) for name, size in KEPT.items()}
+        self._memory = {name: bytes(size) for name, size in KEPT.items()}
         speed, acceleration = (
             round(value * STEPS_PER_DEG) for value in (axis.speed_deg_s, min(axis.acceleration_deg_s2, 600.0))
         )
@@ -130,7 +130,7 @@ class StandaEmulator(Emulator):
             self._reply(WRONG_CHECKSUM)
         elif layout is None:
             if letters != b"asia":
-                self._kept[letters[1:]] = data[:-2]
+                self._memory[letters[1:]] = data[:-2]
             self._reply(letters)
         else:
             self._reply(self._set(letters, layout.unpack(data[:-2])))
@@ -156,8 +156,8 @@ class StandaEmulator(Emulator):
             return message(letters, layout.pack(*questions[letters]()))
         if letters in READ_ONLY:
             return message(letters, bytes(READ_ONLY[letters]))
-        if letters[:1] == b"g" and letters[1:] in self._kept:
-            return message(letters, self._kept[letters[1:]])
+        if letters[:1] == b"g" and letters[1:] in self._memory:
+            return message(letters, self._memory[letters[1:]])
         if letters[:1] == b"g" and letters[1:] in self.settings:
             return message(letters, LAYOUTS[letters].pack(*self.settings[letters[1:]]))
         return UNKNOWN_COMMAND

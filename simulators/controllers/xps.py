@@ -59,13 +59,13 @@ class Gathering:
 
     types: list[tuple[EmulatedAxis, str]] = field(default_factory=list)
     samples: list[tuple[float, ...]] = field(default_factory=list)
-    wanted: int = 0
+    target_count: int = 0
     every_s: float = 0.0
     start_s: float = 0.0
 
     def look(self, now_s: float) -> None:
         """Take what is due by now; no motion began since the last look."""
-        while len(self.samples) < self.wanted:
+        while len(self.samples) < self.target_count:
             due_s = self.start_s + len(self.samples) * self.every_s
             if due_s > now_s:
                 return
@@ -275,9 +275,9 @@ class XPSConversation(Emulator):
                 raise XpsError(OUT_OF_RANGE)
             self._controller.gathering = Gathering(gathering.types, [], int(samples), divisor * CYCLE_S, now_s)
         elif name in ("Stop", "StopAndSave"):
-            gathering.wanted = len(gathering.samples)
+            gathering.target_count = len(gathering.samples)
         elif name == "Reset":
-            gathering.wanted, gathering.samples = 0, []
+            gathering.target_count, gathering.samples = 0, []
         elif name == "CurrentNumberGet":
             return f"{len(gathering.samples)},{1_000_000 // max(1, len(gathering.types))}"
         elif name in ("DataGet", "DataMultipleLinesGet"):

@@ -16,13 +16,13 @@ class LineCollector:
 
     def __init__(self, ends: bytes = b"\r\n") -> None:
         self._ends = ends
-        self._heard = bytearray()
+        self._line = bytearray()
 
     def lines(self, data: bytes) -> Iterator[str]:
         """Lines that end in these bytes, without their ends; empty ones as well."""
         for byte in data:
             if byte in self._ends:
-                line, self._heard = bytes(self._heard), bytearray()
+                line, self._line = bytes(self._line), bytearray()
                 yield line.decode("latin-1")
-            elif len(self._heard) < MOST:
-                self._heard.append(byte)
+            elif len(self._line) < MOST:
+                self._line.append(byte)

@@ -81,7 +81,7 @@ class FaultSchedule:
 
     def __init__(self, faults: Iterable[Fault] = (), seed: int = 0) -> None:
         self._waiting = list(faults)
-        self._left: dict[int, int] = {}
+        self._remaining: dict[int, int] = {}
         self._random = random.Random(seed)
         self.commands = 0
         self.active: dict[FaultKind, Fault] = {}
@@ -109,8 +109,8 @@ class FaultSchedule:
             if fault.kind in ("not_homed", "slip"):
                 self._waiting.remove(fault)
             elif fault.commands is not None:
-                remaining = self._left.get(id(fault), fault.commands) - 1
-                self._left[id(fault)] = remaining
+                remaining = self._remaining.get(id(fault), fault.commands) - 1
+                self._remaining[id(fault)] = remaining
                 if remaining <= 0:
                     self._waiting.remove(fault)
         return self.active

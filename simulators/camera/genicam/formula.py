@@ -108,20 +108,20 @@ class Formula:
     """
 
     def __init__(self, text: str, *, integer: bool) -> None:
-        self._text, self._whole = text, integer
+        self._text, self._integer = text, integer
         if len(text) > _MOST_CHARACTERS:
             raise FormulaError(f"has {len(text):,} characters")
         self._tokens = self._split(text)
-        self._at = self._depth = 0
+        self._position = self._depth = 0
         self._term = self._choice()
-        if self._at != len(self._tokens):
-            raise FormulaError(f"{self._tokens[self._at]!r} is not expected there")
+        if self._position != len(self._tokens):
+            raise FormulaError(f"{self._tokens[self._position]!r} is not expected there")
 
     def value(self, look_up: LookUp) -> Number:
         """Value with the variables that `look_up` knows by name. Raises FormulaError where it has none."""
         try:
             result = self._term(look_up)
-            value = int(result) if self._whole else float(result)
+            value = int(result) if self._integer else float(result)
             if not math.isfinite(value):
                 raise ValueError(f"it is {value}")
             return value
@@ -140,12 +140,12 @@ class Formula:
         return tokens
 
     def _next(self) -> str:
-        return self._tokens[self._at] if self._at < len(self._tokens) else ""
+        return self._tokens[self._position] if self._position < len(self._tokens) else ""
 
     def _take(self, token: str) -> None:
         if self._next() != token:
             raise FormulaError(f"{token!r} is expected and {self._next() or 'the end'!r} comes")
-        self._at += 1
+        self._position += 1
 
     def _choice(self) -> Term:
         self._depth += 1
@@ -153,7 +153,7 @@ class Formula:
             raise FormulaError(f"nested deeper than {_DEEPEST} levels")
         condition = self._binary()
         if self._next() == "?":
-            self._at += 1
+            self._position += 1
             first = self._choice()
             self._take(":")
             second = self._choice()
@@ -165,7 +165,7 @@ class Formula:
     def _binary(self, loosest: int = 0) -> Term:
         left = self._unary()
         while (sign := self._next()) in _BINARY and _BINARY[sign][0] >= loosest:
-            self._at += 1
+            self._position += 1
             tight, does = _BINARY[sign]
             left = _joined(does, left, self._binary(tight + 1))
         return left
@@ -174,7 +174,7 @@ class Formula:
         sign = self._next()
         if sign not in ("-", "+", "~"):
             return self._powered()
-        self._at += 1
+        self._position += 1
         term = self._nested(self._unary)
         if sign == "-":
             return lambda look_up: -term(look_up)
@@ -184,7 +184,7 @@ class Formula:
         base = self._atom()
         if self._next() != "**":
             return base
-        self._at += 1
+        self._position += 1
         return _joined(_power, base, self._nested(self._unary))
 
     def _nested(self, parse: Callable[[], Term]) -> Term:
@@ -197,7 +197,7 @@ class Formula:
 
     def _atom(self) -> Term:
         token = self._next()
-        self._at += 1
+        self._position += 1
         if token == "(":
             inner = self._choice()
             self._take(")")
@@ -215,13 +215,13 @@ class Formula:
     def _number(self, token: str) -> Number:
         if token[:2] in ("0x", "0X"):
             return int(token, 16)
-        return int(token) if token.isdigit() and self._whole else float(token)
+        return int(token) if token.isdigit() and self._integer else float(token)
 
     def _call(self, function: Callable[..., Number]) -> Term:
         self._take("(")
         arguments = [self._choice()]
         while self._next() == ",":
-            self._at += 1
+            self._position += 1
             arguments.append(self._choice())
         self._take(")")
         return lambda look_up: function(*(argument(look_up) for argument in arguments))

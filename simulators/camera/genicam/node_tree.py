@@ -56,7 +56,7 @@ class NodeTree:
         self._around: dict[str, Element] = {}
         self._collect(root)
         # Values of nodes that stand in no register: each program that opens the camera has its own of these.
-        self._kept: dict[str, Number] = {}
+        self._values: dict[str, Number] = {}
         self._assumed: dict[str, Number] = {}
         self._formulas: dict[tuple[str, str], Formula] = {}
         self._way: list[str] = []
@@ -118,7 +118,7 @@ class NodeTree:
                 value = self._calculated(name, "FormulaTo", {"FROM": value})
             target = self._target(name)
             if target is None:
-                self._kept[name] = value
+                self._values[name] = value
             else:
                 self.set_value(target, value)
 
@@ -313,8 +313,8 @@ class NodeTree:
         return node.findtext("pValue")
 
     def _own_value(self, name: str) -> Number:
-        if name in self._kept:
-            return self._kept[name]
+        if name in self._values:
+            return self._values[name]
         node = self.node(name)
         index = node.findtext("pIndex")
         if index is not None:
