@@ -72,7 +72,7 @@ class Differs(AcquisitionError):
             + "\n".join(f"  - {line}" for line in changes)
             + "\nNothing was moved or changed. Restore the first set-up, or start a separate file with --as-new."
         )
-        self.what, self.found = subject, changes
+        self.subject, self.changes = subject, changes
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.what, self.found)
+        return type(self), (self.subject, self.changes)

@@ -77,7 +77,7 @@ def check_all(
     for capture, job in jobs:
         table = unwind(fold_angles(job.table, rig), rig, start_deg)
         for check in check_with_devices(replace(job, table=table), rig, folder, start_deg):
-            results.setdefault((check.what, check.found), check)
+            results.setdefault((check.title, check.detail), check)
         start_deg |= states_deg(table)[-1]
         settings = rig.require_camera().settings
         size = bytes_needed(len(job.table), 1, (settings.height or 0, settings.width or 0))

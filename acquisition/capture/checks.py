@@ -29,16 +29,16 @@ ReadInstrument: TypeAlias = Callable[[Path], InstrumentModel]
 
 @dataclass(frozen=True)
 class CheckResult:
-    """One thing looked at: what, whether it is well, and in words what was found."""
+    """The result of one check: its title, whether it passed, and the detail in words."""
 
-    what: str
+    title: str
     passed: bool
-    found: str
+    detail: str
 
 
 def refuse_failed(checks: Sequence[CheckResult]) -> None:
     """Raise PlanRefused with every check that failed; nothing has moved by then."""
-    failures = [f"{check.what}: {check.found}" for check in checks if not check.passed]
+    failures = [f"{check.title}: {check.detail}" for check in checks if not check.passed]
     if failures:
         raise PlanRefused(failures)
 

@@ -51,9 +51,9 @@ def doctor(
     with StopRequest(patience=1), Console(stderr=True).status("looking at the rig") as status:
         for finding in examine(config, out, frames):
             findings.append(finding)
-            status.update(f"looking at the rig: {escape(shown(finding.what))} done")
+            status.update(f"looking at the rig: {escape(shown(finding.title))} done")
     print_rows(finding.row for finding in findings)
-    if wrong := [finding.what for finding in findings if finding.well is False]:
+    if wrong := [finding.title for finding in findings if finding.well is False]:
         typer.echo(f"not as it should be: {', '.join(wrong)}", err=True)
         raise typer.Exit(1)
 

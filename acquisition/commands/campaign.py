@@ -137,7 +137,7 @@ def _grouped(checks: Sequence[CheckResult]) -> tuple[CheckResult, ...]:
     passed: dict[str, list[str]] = {}
     for check in checks:
         if check.passed:
-            passed.setdefault(check.what, []).append(check.found)
+            passed.setdefault(check.title, []).append(check.detail)
     lines = [
         CheckResult(name, True, texts[0] if len(texts) == 1 else f"{texts[0]} ... {texts[-1]} ({len(texts)} different)")
         for name, texts in passed.items()

@@ -31,16 +31,16 @@ JUMBO_BYTES = 9000
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at. `well` is None for plain information."""
+    """One line of a report. `well` is None for plain information."""
 
-    what: str
+    title: str
     well: bool | None
-    found: str
+    detail: str
 
     @property
     def row(self) -> tuple[str, str, str]:
-        """As it is shown: ok, BAD or nothing, then what was looked at, then what was found."""
-        return {True: "ok", False: "BAD", None: ""}[self.well], self.what, self.found
+        """The columns of the report: ok, BAD or nothing, then title and detail."""
+        return {True: "ok", False: "BAD", None: ""}[self.well], self.title, self.detail
 
 
 def examine(config: RigConfig, folder: Path, frames: int = FRAMES) -> Iterator[Finding]:
@@ -55,7 +55,7 @@ def examine(config: RigConfig, folder: Path, frames: int = FRAMES) -> Iterator[F
     for name, mode in config.modes.items():
         yield _guarded(f"mode {name}", lambda mode=mode: _instrument(mode.instrument))  # type: ignore[misc]
     for check in check_machine(config, config.simulator.samples if config.simulator else ()):
-        yield Finding(check.what, check.passed, check.found)
+        yield Finding(check.title, check.passed, check.detail)
     rig = open_rig(config)
     try:
         yield _guarded("emulators", rig.start) if config.simulator else Finding("rig", None, config.name)

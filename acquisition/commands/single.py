@@ -242,7 +242,7 @@ def say_simulated(console: Console, rig: RigConfig) -> None:
 
 def show_checks(console: Console, checks: tuple[CheckResult, ...]) -> None:
     """One line for each check."""
-    print_rows((("ok" if check.passed else "REFUSED", check.what, check.found) for check in checks), console)
+    print_rows((("ok" if check.passed else "REFUSED", check.title, check.detail) for check in checks), console)
 
 
 def summarize(job: Job, result: Result) -> None:

@@ -64,12 +64,12 @@ class Guard:
     config : the rig that is open there; its ports are addresses of descriptors where they were handed over.
     pid : of the `acquire` that is watched.
     journal : where everything is noted.
-    own : the same rig with the ports as the rig file has them, for tries after `acquire` has ended.
+    file_rig : the same rig with the ports as the rig file has them, for tries after `acquire` has ended.
     """
 
-    def __init__(self, config: RigConfig, pid: int, journal: Journal, own: RigConfig | None = None) -> None:
+    def __init__(self, config: RigConfig, pid: int, journal: Journal, file_rig: RigConfig | None = None) -> None:
         self.config, self.pid, self.journal = config, pid, journal
-        self.own = own or config
+        self.file_rig = file_rig or config
         # Nobody waits for them; they are kept because a handle that is dropped complains.
         self.alerts: list[subprocess.Popen[bytes]] = []
         self._cutoff_lines = LineRegistry()
@@ -202,7 +202,7 @@ class Guard:
                 except Exception as error:  # noqa: BLE001 - the source comes next, whatever this was
                     problems.append(str(error))
             # The port that was handed over, then the port by its name: one of the two may be gone.
-            for config in (self.config, self.own) if self.own is not self.config else (self.config,):
+            for config in (self.config, self.file_rig) if self.file_rig is not self.config else (self.config,):
                 if config.source is None:
                     break
                 try:

@@ -20,15 +20,15 @@ QUANTITIES = tuple(NOISE)
 class Budget:
     """Mean squares over the arm angles of one figure of merit at one wavelength; a negative one made it better.
 
-    `rest` is what is left over when sphere and material are right and the noise is off: for xi0 that the scene is not
-    triply degenerate.
+    `remainder` is the share with the true sphere and material and without noise: for xi0, the scene is not triply
+    degenerate.
     """
 
     total: float
     noise: float
     registration: float
     material: float
-    rest: float
+    remainder: float
 
 
 def budget(study: SphereStudy, nm: float, quantity: str) -> Budget:

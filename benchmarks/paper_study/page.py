@@ -169,7 +169,7 @@ def _budget(sphere: SphereStudy, wavelengths: Sequence[float]) -> ReportSection:
     for nm in wavelengths:
         for name in QUANTITIES:
             shares = budget(sphere, nm, name)
-            squares = (shares.total, shares.noise, shares.registration, shares.material, shares.rest)
+            squares = (shares.total, shares.noise, shares.registration, shares.material, shares.remainder)
             rows.append([f"{nm:g} nm, {LABELS[name]}", *(f"{signed_root(square):.2f}" for square in squares)])
     note = (
         "contributions as roots of mean squares over Omega; they add as squares. Noise: what the captures' error bars "
@@ -182,11 +182,11 @@ def _budget(sphere: SphereStudy, wavelengths: Sequence[float]) -> ReportSection:
 
 def _fault(fault: FaultStudy, wavelengths: Sequence[float]) -> ReportSection:
     lines = []
-    for effect in fault.found.effects:
+    for effect in fault.result.effects:
         values = ", ".join(f"{name} {value.told} {value.unit}" for name, value in effect.parameters.items())
         lines.append((f"found: {effect.kind}", values))
     text = f"{FAULT['parameter']} of {FAULT['element']} is {FAULT['offset']:g} degrees off, which no file says"
-    summary = [("the fault", text), ("diagnose", f"{fault.found.verdict}. {fault.found.recommendation}"), *lines]
+    summary = [("the fault", text), ("diagnose", f"{fault.result.verdict}. {fault.result.recommendation}"), *lines]
     rows = [["", "Omega", *(f"{LABELS[name]}, {when}" for name in QUANTITIES for when in ("before", "after"))]]
     for before, after in zip(fault.before.rows, fault.after.rows, strict=True):
         key = (before.wavelength_nm, before.omega_deg)

@@ -65,7 +65,7 @@ class FaultStudy:
 
     before: CampaignResult
     after: CampaignResult
-    found: Diagnosis
+    result: Diagnosis
     xi0_percent: dict[str, dict[tuple[float, float], float]]
 
 

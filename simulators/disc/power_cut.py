@@ -15,9 +15,9 @@ SECTOR = 512
 
 @dataclass(frozen=True)
 class Call:
-    """One recorded call: what, on which path, where, and the bytes of a write or the new name of a rename."""
+    """One recorded call: its kind, on which path, where, and the bytes of a write or the new name of a rename."""
 
-    what: str
+    kind: str
     path: str
     offset: int
     data: bytes
@@ -53,17 +53,17 @@ class UnreliableDisc:
     def apply(self, call: Call) -> None:
         """Carry out a call."""
         file = self._names.get(call.path)
-        if call.what in ("create", "open", "mkdir") and file is None:
-            self._name(call.path, _File(folder=call.what == "mkdir"))
-        elif call.what in ("write", "truncate", "allocate", "create") and file is not None:
+        if call.kind in ("create", "open", "mkdir") and file is None:
+            self._name(call.path, _File(folder=call.kind == "mkdir"))
+        elif call.kind in ("write", "truncate", "allocate", "create") and file is not None:
             file.waiting.append(call)
-        elif call.what == "rename" and file is not None:
+        elif call.kind == "rename" and file is not None:
             self._waiting.append((call.path, call.data.decode(), file))
             self._names[call.data.decode()] = self._names.pop(call.path)
-        elif call.what == "unlink":
+        elif call.kind == "unlink":
             self._names.pop(call.path, None)
             self._waiting.append((call.path, "", None))
-        elif call.what == "sync":
+        elif call.kind == "sync":
             self._sync(call.path, file)
 
     def _name(self, path: str, file: _File) -> None:
@@ -110,7 +110,7 @@ def _content(file: _File, chance: random.Random | None) -> bytes:
         fate = chance.random()
         if fate < 0.4:
             _carry_out(content, call)
-        elif fate < 0.6 and call.what == "write":
+        elif fate < 0.6 and call.kind == "write":
             for start in range(0, len(call.data), SECTOR):
                 if chance.random() < 0.5:
                     sector = Call("write", call.path, call.offset + start, call.data[start : start + SECTOR])
@@ -119,10 +119,10 @@ def _content(file: _File, chance: random.Random | None) -> bytes:
 
 
 def _carry_out(content: bytearray, call: Call) -> None:
-    if call.what in ("create", "truncate"):
+    if call.kind in ("create", "truncate"):
         del content[call.offset :]
     size = call.offset + len(call.data)
     if size > len(content):
         content.extend(bytes(size - len(content)))
-    if call.what == "write":
+    if call.kind == "write":
         content[call.offset : size] = call.data

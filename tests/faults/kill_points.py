@@ -127,7 +127,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def check(out: Path, whole: dict[str, bytes]) -> str:
     """What is wrong with a campaign that came to its end, or nothing."""
-    wrong = [f"{f.what}: {f.found}" for f in verify(out / "night") if f.well is not True]
+    wrong = [f"{f.title}: {f.detail}" for f in verify(out / "night") if f.well is not True]
     there = contents(out)
     differing = sorted(name for name in {*whole, *there} if whole.get(name) != there.get(name))
     if differing:
@@ -263,7 +263,7 @@ def power(options: list[str], cuts: int, seed: int = 1) -> int:
     for end in chosen:
         for call in calls[done:end]:
             disc.apply(call)
-            reported += call.what == "note"
+            reported += call.kind == "note"
         done = end
         for kept in (None, random.Random(chance.random())):
             files = disc.after_power_cut(kept)
@@ -343,7 +343,7 @@ def image(options: list[str], cuts: int, seed: int = 1) -> int:
             there, unreadable = _left(copy / "run" / "night")
         finally:
             subprocess.run(["umount", copy], check=True)
-        reported = sum(call.what == "note" for call in read_record(log)) if log.exists() else 0
+        reported = sum(call.kind == "note" for call in read_record(log)) if log.exists() else 0
         worst = max(worst, reported - there)
         if reported - there > 1 or unreadable:
             lost += 1

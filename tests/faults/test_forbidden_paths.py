@@ -171,7 +171,7 @@ def test_the_dry_run_looks_at_the_way_between_captures(rig_with, tmp_path, endle
         jobs.append((CampaignCapture(number=number, name=f"{number}.h5", plan=plan), prepare(plan, config)))
     with open_rig(config) as rig:
         _, checks = check_all(jobs, rig, tmp_path)
-        assert [check.what for check in checks if not check.passed] == ([] if passes else ["first move"])
+        assert [check.title for check in checks if not check.passed] == ([] if passes else ["first move"])
         if passes:
             for capture, job in jobs:
                 refuse_failed(check_with_devices(job, rig, tmp_path))
