@@ -184,11 +184,11 @@ def picture(fault: TypicalFault) -> Figure:
         lit = np.abs(r).max(axis=0) > 0
         means = r[:, lit].mean(axis=1) if lit.any() else np.zeros(len(r))
         states.plot(means, "o-", ms=2, lw=0.8, color=colour, label=name)
-        shown = axis.imshow(np.sqrt((r**2).mean(axis=0)), vmin=0, vmax=end, cmap="viridis", interpolation="nearest")
+        mappable = axis.imshow(np.sqrt((r**2).mean(axis=0)), vmin=0, vmax=end, cmap="viridis", interpolation="nearest")
         axis.set_title(name, fontsize=7.5, color=colour)
         axis.set_xticks([])
         axis.set_yticks([])
-    bar = figure.colorbar(shown, ax=maps, shrink=0.9)
+    bar = figure.colorbar(mappable, ax=maps, shrink=0.9)
     bar.ax.tick_params(labelsize=6.5)
     bar.set_label("%", fontsize=7)
     states.set_xlabel("state", fontsize=7.5)

@@ -32,8 +32,8 @@ def fall_of(components: float) -> float:
 
 def blocks(components: float, random: np.random.Generator, draws: int = DRAWS) -> np.ndarray:
     """Of independent noise in 15 directions, what the 8 of a block of three eigenvalues see: (draws, 8, 15)."""
-    turned = np.linalg.qr(random.normal(size=(draws, 15, 8)))[0]
-    into = np.swapaxes(turned, 1, 2) * fall_of(components) ** (np.arange(15) / 2)
+    directions = np.linalg.qr(random.normal(size=(draws, 15, 8)))[0]
+    into = np.swapaxes(directions, 1, 2) * fall_of(components) ** (np.arange(15) / 2)
     return np.asarray(into / np.sqrt(np.square(into).sum(axis=(1, 2), keepdims=True) / 8))
 
 
@@ -89,10 +89,10 @@ def bound(
     for _ in range(ROUNDS):
         misses, slopes = [], []
         for gaps, (observed, errors, plain) in drawn.items():
-            between = errors[:, k : k + 1] * plain
-            z = (observed[:, k] + between @ shift - deviations(*gaps)[k]) / np.sqrt(OF_MEAN)
+            interpolation = errors[:, k : k + 1] * plain
+            z = (observed[:, k] + interpolation @ shift - deviations(*gaps)[k]) / np.sqrt(OF_MEAN)
             misses.append(ndtr(z).mean() - level)
-            slopes.append(np.exp(-(z**2) / 2) @ between / len(z) / np.sqrt(2 * np.pi * OF_MEAN))
+            slopes.append(np.exp(-(z**2) / 2) @ interpolation / len(z) / np.sqrt(2 * np.pi * OF_MEAN))
         slope = np.array(slopes)
         right = slope.T @ np.array(misses) + penalty @ shift
         step = np.linalg.solve(slope.T @ slope + penalty + 1e-9 * np.eye(nodes**2), right)

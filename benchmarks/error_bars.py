@@ -100,11 +100,11 @@ def cells_of(
     planes = _planes(noisy_image(np.repeat(stack, pixels, axis=0), electrons, seed, w, darks=darks), extra)
     length_of = {angle: length for length, angles in ANGLES_OF.items() for angle in angles}
     for k, sample in enumerate(matrices):
-        mine = slice(k * pixels, (k + 1) * pixels)
+        block = slice(k * pixels, (k + 1) * pixels)
         for name in planes:
             if f"{name}_errors" not in planes:
                 continue
-            value, error = (planes[n][..., mine].astype(float) for n in (name, f"{name}_errors"))
+            value, error = (planes[n][..., block].astype(float) for n in (name, f"{name}_errors"))
             true, true_error = (truth[n][..., k : k + 1].astype(float) for n in (name, f"{name}_errors"))
             if name == "mueller":
                 true = stack[k].reshape(4, 4, 1, 1) * electrons / w[:, 0].mean()
@@ -113,14 +113,14 @@ def cells_of(
             least, most = whole_range(name, value)
             if bounds is None:
                 low, high = value - NORMAL_95 * error, value + NORMAL_95 * error
-                lost = ~np.isfinite(value) & (error >= most - least)
-                low, high = np.where(lost, least, low), np.where(lost, most, high)
+                is_unbounded = ~np.isfinite(value) & (error >= most - least)
+                low, high = np.where(is_unbounded, least, low), np.where(is_unbounded, most, high)
             else:
-                low, high = bounds[..., mine].astype(float)
+                low, high = bounds[..., block].astype(float)
             period = period_deg(name, "degree" if name.endswith("_deg") else "")
-            off = value - true
+            deviation = value - true
             if period is not None:
-                off -= period * np.round(off / period)
+                deviation -= period * np.round(deviation / period)
             exists = np.isfinite(true) & (true_error < UNDEFINED * (180 if "_deg" in name else 1))
             if name in length_of:
                 length, noise = (truth[n][..., k : k + 1] for n in (length_of[name], f"{length_of[name]}_errors"))
@@ -131,11 +131,11 @@ def cells_of(
             is_finite = exists & np.isfinite(error) & np.isfinite(value)
             tolerance = ROUNDING + 3 * true_error
             with np.errstate(invalid="ignore", divide="ignore"):
-                pull = (off / error)[is_finite]
-                inside_95 = ((off <= value - low + tolerance) & (off >= value - high - tolerance))[exists]
-                inside_68 = (np.abs(off) <= error + tolerance)[exists]
+                pull = (deviation / error)[is_finite]
+                inside_95 = ((deviation <= value - low + tolerance) & (deviation >= value - high - tolerance))[exists]
+                inside_68 = (np.abs(deviation) <= error + tolerance)[exists]
                 if f"{name}_68" in planes:
-                    bounds = planes[f"{name}_68"][..., mine]
+                    bounds = planes[f"{name}_68"][..., block]
                     inside_68 = ((bounds[0] <= true + tolerance) & (true - tolerance <= bounds[1]))[exists]
             # Where there is no value the interval is everything.
             unknown = (~np.isfinite(value) & (low <= true + tolerance) & (true - tolerance <= high))[exists]
@@ -176,14 +176,14 @@ def table(results: Sequence[Cell]) -> str:
     lines = ["| quantity | electrons | cells | 68 % | 95 % | pull | in all limits |", "|---|---|---|---|---|---|---|"]
     for name in dict.fromkeys(c.quantity for c in results):
         for electrons in dict.fromkeys(c.electrons for c in results):
-            some = [c for c in results if c.quantity == name and c.electrons == electrons]
-            if some:
-                parts = [[100 * c.in_68 for c in some], [100 * c.in_95 for c in some]]
-                shown = [f"{np.median(p):.0f} ({min(p):.0f} to {max(p):.0f})" for p in parts]
-                pulls = [c.rms for c in some if np.isfinite(c.rms)]
+            group = [c for c in results if c.quantity == name and c.electrons == electrons]
+            if group:
+                parts = [[100 * c.in_68 for c in group], [100 * c.in_95 for c in group]]
+                shares = [f"{np.median(p):.0f} ({min(p):.0f} to {max(p):.0f})" for p in parts]
+                pulls = [c.rms for c in group if np.isfinite(c.rms)]
                 pull = f"{np.median(pulls):.2f} ({min(pulls):.2f} to {max(pulls):.2f})" if pulls else "-"
-                good = sum(holds(c) for c in some)
-                lines.append(f"| {name} | {electrons:g} | {len(some)} | {' | '.join(shown)} | {pull} | {good} |")
+                valid = sum(holds(c) for c in group)
+                lines.append(f"| {name} | {electrons:g} | {len(group)} | {' | '.join(shares)} | {pull} | {valid} |")
     return "\n".join(lines) + "\n"
 
 
@@ -192,15 +192,15 @@ def table_of_everything(results: Sequence[Cell]) -> str:
     lines = ["| quantity | electrons | above 97 % | by whole ranges | whole ranges | others |", 6 * "|---" + "|"]
     for name in dict.fromkeys(c.quantity for c in results):
         for electrons in dict.fromkeys(c.electrons for c in results):
-            some = [c for c in results if c.quantity == name and c.electrons == electrons]
-            above = [c for c in some if c.in_95 > MOST_95]
+            group = [c for c in results if c.quantity == name and c.electrons == electrons]
+            over_97 = [c for c in group if c.in_95 > MOST_95]
             # The others cover no more than they claim, or are too few to tell.
-            by_range = [c for c in above if not c.in_95_others > MOST_95 or c.everything > 1 - FEW]
-            weights = np.array([1 - c.everything for c in some])
-            weighted = np.array([c.in_95_others for c in some])[weights > 0] @ weights[weights > 0]
-            share = 100 * np.mean([c.everything for c in some]) if some else 0
-            covered = f"{100 * weighted / weights.sum():.1f}" if weights.sum() > 0 else "-"
-            lines.append(f"| {name} | {electrons:g} | {len(above)} | {len(by_range)} | {share:.0f} | {covered} |")
+            by_range = [c for c in over_97 if not c.in_95_others > MOST_95 or c.everything > 1 - FEW]
+            weights = np.array([1 - c.everything for c in group])
+            weighted = np.array([c.in_95_others for c in group])[weights > 0] @ weights[weights > 0]
+            share = 100 * np.mean([c.everything for c in group]) if group else 0
+            coverage = f"{100 * weighted / weights.sum():.1f}" if weights.sum() > 0 else "-"
+            lines.append(f"| {name} | {electrons:g} | {len(over_97)} | {len(by_range)} | {share:.0f} | {coverage} |")
     return "\n".join(lines) + "\n"
 
 

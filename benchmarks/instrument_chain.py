@@ -71,9 +71,9 @@ def emulated(
     file.write_text(text, encoding="utf-8")
     nominal = InstrumentModel.load(file)
     true = nominal.at(bench.nm)
-    for value, by in bench.wrong.items():
+    for value, error in bench.wrong.items():
         place, _, field = value.rpartition(".")
-        true = true.with_values({place: {field: float(true.value_of(value) or 0.0) + by}})  # type: ignore[arg-type]
+        true = true.with_values({place: {field: float(true.value_of(value) or 0.0) + error}})  # type: ignore[arg-type]
     random = np.random.default_rng(seed)
     air = emulated_capture(
         true,
@@ -89,8 +89,8 @@ def emulated(
     def truth(product: dict[str, Array]) -> Array:
         if "stokes" not in product:
             return SAMPLE / SAMPLE[0, 0]
-        sent = SAMPLE @ true.generator_states({})[0]
-        return np.asarray(sent / sent[0])
+        stokes = SAMPLE @ true.generator_states({})[0]
+        return np.asarray(stokes / stokes[0])
 
     return chain(name, air, sample, file, truth=truth, reference="the emulated sample")
 
@@ -115,8 +115,8 @@ def chain(
         expected = truth(product).reshape(values.shape)
         valid = np.isfinite(values) & (np.arange(values.size) > 0)
         errors.append((_rms(values[valid] - expected[valid]), _rms(stated[valid])))
-    (nominal, _), (alone, _), (written, stated) = errors
-    return Row(name, nominal, alone, written, stated, diagnosis.verdict, reference)
+    (nominal, _), (train_only, _), (written, stated) = errors
+    return Row(name, nominal, train_only, written, stated, diagnosis.verdict, reference)
 
 
 def half_wave_plate(nm: int, files: Mapping[str, Path], folder: Path, draw: int = 0) -> Row:

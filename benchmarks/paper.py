@@ -38,11 +38,11 @@ def run(work: Path, out: Path, size: Size, pool: Executor, *, figure: Path | Non
         print(f"{time.perf_counter() - begin:6.0f} s  {text}", flush=True)
 
     def taken(number: int) -> Path:
-        started = time.perf_counter()
+        begin = time.perf_counter()
         part = parts(size)[number]
         say(f"acquire: {part.name}")
         folder = take_captures(work, size, part)
-        seconds[f"captures of {part.name}"] = time.perf_counter() - started
+        seconds[f"captures of {part.name}"] = time.perf_counter() - begin
         return folder
 
     # One camera is emulated at a time; what is taken is worked on while the next part is taken.

@@ -18,8 +18,8 @@ def ratio_of_channels(air: Array, plate: Array) -> Array:
 
     def rows(x: Array, theta_deg: Array) -> Array:
         t = np.deg2rad(theta_deg)
-        sent = mueller.retarder(np.deg2rad(45.0), x[9]) @ mueller.polarizer(0.0, 0.0)[:, :1]
-        g = (mueller.retarder(t + x[0], x[1]) @ sent)[..., 0]
+        light = mueller.retarder(np.deg2rad(45.0), x[9]) @ mueller.polarizer(0.0, 0.0)[:, :1]
+        g = (mueller.retarder(t + x[0], x[1]) @ light)[..., 0]
         plate = mueller.retarder(5 * t + x[2], x[3])
         a = np.stack(
             [mueller.polarizer(x[4], x[6])[0] @ plate, x[8] * mueller.polarizer(x[5], x[7])[0] @ plate], axis=1

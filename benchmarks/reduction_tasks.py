@@ -80,8 +80,8 @@ def write_frames(
     writer = CaptureWriter.create(path, header, table, shape, start_time="2026-01-01T00:00:00+00:00")
     created = time.perf_counter()
     for n, pixels in enumerate(frames):
-        turned = {axis: float(values[n]) for axis, values in table.angles_deg.items()}
-        writer.put(StateRecord(n, pixels, {axis: Position(deg, deg) for axis, deg in turned.items()}))
+        pose = {axis: float(values[n]) for axis, values in table.angles_deg.items()}
+        writer.put(StateRecord(n, pixels, {axis: Position(deg, deg) for axis, deg in pose.items()}))
     writer.seal("complete", {})
     return created - begin, time.perf_counter() - created
 

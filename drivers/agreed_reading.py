@@ -51,18 +51,18 @@ class AgreeingReadings:
         self, request: str, read: Callable[[], float], is_moving: Callable[[], bool], tolerance: float
     ) -> tuple[float, bool]:
         disturbed = self._clock.now_s() - self._disturbed_s < _MEMORY_S
-        alike = _DISTURBED if disturbed else _CALM
+        agreement = _DISTURBED if disturbed else _CALM
         readings, moving = [read()], 0
-        while len(readings) < _TRIES * (alike - 1):
+        while len(readings) < _TRIES * (agreement - 1):
             readings.append(read())
-            if len(readings) >= alike and len(set(readings[-alike:])) == 1:
+            if len(readings) >= agreement and len(set(readings[-agreement:])) == 1:
                 return readings[-1], True
             if readings[-1] == readings[-2]:
                 continue
             # A servo trembles within the tolerance, and so can a changed last digit: the middle is right.
-            window = sorted(readings[-2 * alike + 1 :])
+            window = sorted(readings[-2 * agreement + 1 :])
             middle = window[len(window) // 2]
-            if len(window) == 2 * alike - 1 and window[-1] - window[0] <= tolerance:
+            if len(window) == 2 * agreement - 1 and window[-1] - window[0] <= tolerance:
                 return middle, True
             # In motion readings differ. One reply that says "moving" may itself be the disturbed one.
             moving = moving + 1 if is_moving() else 0
@@ -70,7 +70,7 @@ class AgreeingReadings:
                 return middle, False
             if moving == 0 and abs(readings[-1] - readings[-2]) > tolerance:
                 self._disturbed_s = self._clock.now_s()
-                alike = _DISTURBED
+                agreement = _DISTURBED
         raise ReplyError(
             request,
             f"readings at rest that contradict each other: {readings}",

@@ -300,7 +300,7 @@ class Camera(ABC):
                 self._do_wait_exposed()
                 frame = self._next_frame()
             except FrameLost as error:
-                lost = error
+                loss = error
                 if attempt < self._allowed_retakes:
                     self._retakes += 1
                     log.warning(
@@ -311,10 +311,10 @@ class Camera(ABC):
                 mean.add(frame)
             return frame
         raise FrameLost(
-            lost.asked,
-            f"{lost.came_back}; {self._allowed_retakes + 1} tries in a row failed",
-            lost.what_to_do,
-        ) from lost
+            loss.asked,
+            f"{loss.came_back}; {self._allowed_retakes + 1} tries in a row failed",
+            loss.what_to_do,
+        ) from loss
 
     # --- state -------------------------------------------------------------------------------------------
 

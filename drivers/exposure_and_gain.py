@@ -219,11 +219,11 @@ class ExposureAndGain:
         if "Manual" in self._features.choices("BslSensorBitDepthMode"):
             self._features.set_choice("BslSensorBitDepthMode", "Manual")
         entry_of_bits = {bits: entry for entry in self._features.choices(name) if (bits := _bits_in(entry)) is not None}
-        enough = [bits for bits in entry_of_bits if bits >= fmt.bits]
+        sufficient = [bits for bits in entry_of_bits if bits >= fmt.bits]
         if not entry_of_bits or (self.converter_bits() or 0) >= fmt.bits:
             return
         try:
-            self._features.set_value(name, entry_of_bits[min(enough) if enough else max(entry_of_bits)])
+            self._features.set_value(name, entry_of_bits[min(sufficient) if sufficient else max(entry_of_bits)])
         except CameraLost:
             raise
         except CameraError:

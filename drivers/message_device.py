@@ -44,7 +44,7 @@ class MessageDevice:
         self.lock = threading.RLock()
         action = f"open {port}"
         self._is_held = port.startswith(HELD)
-        names = [who for pid, who in port_holders(port) if pid != os.getpid() and who != f"{held_by} (pid {pid})"]
+        names = [name for pid, name in port_holders(port) if pid != os.getpid() and name != f"{held_by} (pid {pid})"]
         if names:
             raise PortBusy(action, f"it is in use by {', '.join(names)}", f"{end_the_holder(port)}; nothing was sent")
         try:

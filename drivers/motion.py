@@ -148,13 +148,13 @@ class Motion:
         more["unit"] = self.axis.config.unit
         return kind(self.axis.name, self.target_deg, last_deg, elapsed_s, allowed_s=self.allowed_s, why=why, **more)
 
-    def _stop_and_describe(self, why: str) -> MotionFailed:
+    def _stop_and_describe(self, reason: str) -> MotionFailed:
         """Stop the axis, then say what happened; a stop that fails as well is part of the message."""
         try:
             self.axis.stop()
         except DeviceError as error:
-            why = f"{why}; and the stop failed too ({error})"
-        return self._make_error(MotionFailed, why)
+            reason = f"{reason}; and the stop failed too ({error})"
+        return self._make_error(MotionFailed, reason)
 
 
 class MotionAxis(ABC):

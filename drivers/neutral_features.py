@@ -187,8 +187,8 @@ class NeutralFeatures:
         SettingRefused
             One that spoils the frames is not neutral.
         """
-        wrong = list(self._not_neutral())
-        if harmful := [text for text, rule in wrong if rule.harm]:
+        issues = list(self._not_neutral())
+        if harmful := [text for text, rule in issues if rule.harm]:
             raise SettingRefused(
                 f"camera {self._name}, bring it to a known state",
                 "; ".join(harmful),
@@ -196,7 +196,7 @@ class NeutralFeatures:
                 "frames are right with it",
             )
         reported = set(self.remarks)
-        self.remarks += [text for text, _ in wrong if text not in reported]
+        self.remarks += [text for text, _ in issues if text not in reported]
 
     def _load(self) -> Iterator[str]:
         """Load the default user set; yields what is left unknown."""
@@ -234,8 +234,8 @@ class NeutralFeatures:
         if name is None or not isinstance(now, float):
             return None
         for trial_us in (1.37 * now, 0.73 * now):
-            if self._try(name, float(round(trial_us))) and isinstance(back := self._value(name), float) and back != now:
-                return name, back
+            if self._try(name, float(round(trial_us))) and isinstance(echo := self._value(name), float) and echo != now:
+                return name, echo
         return None
 
     def _remark_unknown(self, why: str) -> Iterator[str]:
@@ -257,11 +257,11 @@ class NeutralFeatures:
         if selector is None or not entries:
             yield
             return
-        chosen = features.text((selector,))
+        selected = features.text((selector,))
         for entry in entries:
             if self._try(selector, entry):
                 yield
-        self._try(selector, chosen)
+        self._try(selector, selected)
 
     def _try(self, name: str, value: str | float | bool) -> bool:
         """Set a feature; False where the camera does not take it."""

@@ -289,9 +289,9 @@ def pixel_format_of(code: int, name: str) -> PixelFormat:
         As `pixel_format`; also where the name is known, but the code says another size of a pixel.
     """
     code &= 0xFFFFFFFF
-    named = _BY_NAME.get(name)
-    if code not in _BY_CODE and named is not None and named.code is None and named.bits_in_memory == code >> 16 & 0xFF:
-        return replace(named, code=code)
+    entry = _BY_NAME.get(name)
+    if code not in _BY_CODE and entry is not None and entry.code is None and entry.bits_in_memory == code >> 16 & 0xFF:
+        return replace(entry, code=code)
     return pixel_format(code)
 
 
@@ -307,9 +307,9 @@ def pixel_format(name_or_code: str | int) -> PixelFormat:
     code = name_or_code & 0xFFFFFFFF if isinstance(name_or_code, int) else None
     known_format = _BY_NAME.get(str(name_or_code)) if code is None else _BY_CODE.get(code)
     if known_format is None:
-        shown = str(name_or_code) if code is None else f"code 0x{code:08x} ({code >> 16 & 0xFF} bits a pixel)"
+        label = str(name_or_code) if code is None else f"code 0x{code:08x} ({code >> 16 & 0xFF} bits a pixel)"
         raise UnknownPixelFormat(
-            f"pixel format {shown}",
+            f"pixel format {label}",
             "its layout in memory is not known here",
             "Choose one of " + ", ".join(fmt.name for fmt in PIXEL_FORMATS),
         )

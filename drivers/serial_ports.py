@@ -126,8 +126,8 @@ def port_holders(port: str) -> list[tuple[int, str]]:
     holders = []
     for process in Path("/proc").glob("[0-9]*"):
         try:
-            held = any(os.readlink(entry) == target for entry in (process / "fd").iterdir())
-            if held:
+            is_open = any(os.readlink(entry) == target for entry in (process / "fd").iterdir())
+            if is_open:
                 name = (process / "comm").read_text().strip()
                 holders.append((int(process.name), f"{name} (pid {process.name})"))
         except OSError:

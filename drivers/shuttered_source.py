@@ -55,12 +55,12 @@ def open_with_shutter(
     """Open the source, and the shutter where there is one; changes nothing."""
     with (
         lines.link(config, baudrate, prompt_framer) as link,
-        contextlib.ExitStack() as failed,
+        contextlib.ExitStack() as cleanup,
     ):
         shutter: LightSource | None = None
         if config.shutter is not None:
             shutter = sc10.open(config.shutter, lines)
-            failed.callback(shutter.close)
+            cleanup.callback(shutter.close)
         source = make(config, link, shutter, lines)
-        failed.pop_all()
+        cleanup.pop_all()
         return source

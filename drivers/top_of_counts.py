@@ -87,10 +87,10 @@ class TopOfCounts:
             return
         step = self.step
         lowest = max(0, largest - _STEPS_BELOW * step)
-        below = np.bincount(pixels[(pixels >= lowest) & (pixels < largest)].reshape(-1) - lowest, minlength=1)
-        if at_largest < _FACTOR * int(below.max()):
+        lower_counts = np.bincount(pixels[(pixels >= lowest) & (pixels < largest)].reshape(-1) - lowest, minlength=1)
+        if at_largest < _FACTOR * int(lower_counts.max()):
             return
-        if below.any():
+        if lower_counts.any():
             self._pile = largest
             return
         self._candidates[largest] = self._candidates.get(largest, 0) + 1

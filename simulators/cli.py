@@ -69,10 +69,10 @@ def serve(
         emulator = kinds[kind](options)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
-    with _stop_event() as ended, port_for(emulator) as port:
+    with _stop_event() as stop, port_for(emulator) as port:
         typer.echo(port.path)
         sys.stdout.flush()
-        while not ended.wait(0.2) and port.is_serving():
+        while not stop.wait(0.2) and port.is_serving():
             pass
 
 
@@ -93,12 +93,12 @@ def rig(
 
     try:
         with (
-            _stop_event() as ended,
+            _stop_event() as stop,
             served_rig.serve(rig_file, out, sample, mode, wavelength_nm=wavelength, omega_deg=omega),
         ):
             typer.echo(out)
             sys.stdout.flush()
-            ended.wait()
+            stop.wait()
     except (ProcessError, DeviceError) as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(1) from None

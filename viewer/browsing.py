@@ -84,10 +84,10 @@ class Listed:
         pages = max(1, -(-len(entries) // MOST))
         number = query.get(f"{key}_page", "1")
         page = min(max(int(number) if number.isdecimal() else 1, 1), pages)
-        shown = entries[(page - 1) * MOST : page * MOST]
-        of_shown = tuple((name, counts[name]) for e in shown if counts for name in [groups[group](e)])
+        page_entries = entries[(page - 1) * MOST : page * MOST]
+        of_shown = tuple((name, counts[name]) for e in page_entries if counts for name in [groups[group](e)])
         root = pages_of(request).root
-        return cls(shown, page, pages, len(entries), key, sort, query, root, group if counts else "", of_shown)
+        return cls(page_entries, page, pages, len(entries), key, sort, query, root, group if counts else "", of_shown)
 
     def at(self, page: int) -> str:
         """Address of a page of the list."""

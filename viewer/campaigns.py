@@ -99,9 +99,9 @@ class CampaignView:
         cells = [c for c in self.cells if (c.mode, c.wavelength_nm) == (mode, wavelength_nm)]
         plain = [c for c in cells if not c.reference]
         angles = tuple(sorted({c.omega_deg for c in plain}))
-        at = {(c.sample, c.omega_deg): c for c in plain}
+        cell_of = {(c.sample, c.omega_deg): c for c in plain}
         samples = dict.fromkeys(c.sample for c in plain)
-        rows = tuple((sample, tuple(at.get((sample, angle)) for angle in angles)) for sample in samples)
+        rows = tuple((sample, tuple(cell_of.get((sample, angle)) for angle in angles)) for sample in samples)
         return CampaignBlock(mode, wavelength_nm, angles, rows, tuple(c for c in cells if c.reference))
 
 
@@ -187,21 +187,21 @@ def _events(log: Path) -> Iterator[dict[str, Any]]:
 
 
 def _bars(events: list[dict[str, Any]]) -> Iterator[Bar]:
-    started: tuple[str, str] | None = None
+    open_bar: tuple[str, str] | None = None
     for event in events:
         kind, when = event.get("event"), str(event.get("time", ""))
         if kind == "capture started":
-            started = (str(event.get("capture")), when)
-        elif started is not None and kind in ("capture ended", "capture failed", "campaign stopped at once"):
+            open_bar = (str(event.get("capture")), when)
+        elif open_bar is not None and kind in ("capture ended", "capture failed", "campaign stopped at once"):
             status = {"capture ended": str(event.get("status")), "capture failed": "failed"}.get(str(kind), "partial")
-            yield Bar(*started, when, {"complete": "done", "aborted": "partial"}.get(status, status))
-            started = None
-        elif started is not None and kind == "campaign started":
+            yield Bar(*open_bar, when, {"complete": "done", "aborted": "partial"}.get(status, status))
+            open_bar = None
+        elif open_bar is not None and kind == "campaign started":
             # What was killed has no end of its own.
-            yield Bar(*started, when, "failed")
-            started = None
-    if started is not None:
-        yield Bar(*started, None, "running")
+            yield Bar(*open_bar, when, "failed")
+            open_bar = None
+    if open_bar is not None:
+        yield Bar(*open_bar, None, "running")
 
 
 def _match_grid(bar: Bar, cell: Cell | None, entry: Entry | None) -> Bar:

@@ -105,23 +105,23 @@ def difference(request: Request) -> Response:
             window = Window.asked(query, early.frame_shape, most=640)
             plane_a, plane_b = (capture_values(capture, query, window) for capture in (early, late))
             name, units, scale = None, "counts", ColourScale(LIGHT, *_ends(plane_a[0]))
-    apart = plane_a[0] - plane_b[0]
+    deviation = plane_a[0] - plane_b[0]
     if (period := None if name is None else period_deg(name, units)) is not None:
-        apart = (apart + period / 2) % period - period / 2
+        deviation = (deviation + period / 2) % period - period / 2
     noise = np.hypot(plane_a[1], plane_b[1]) if shared is None else shared
     with np.errstate(divide="ignore", invalid="ignore"):
-        over = apart / np.hypot(noise, systematic)
-    wide = scale_of("deviation", "", apart)
+        significance = deviation / np.hypot(noise, systematic)
+    wide = scale_of("deviation", "", deviation)
     scales = [scale, scale, wide, ColourScale(SIGNED, -ERRORS_SHOWN, ERRORS_SHOWN)]
     return sent(
         window,
-        np.stack([plane_a[0], plane_b[0], apart, over]).astype(np.float32),
+        np.stack([plane_a[0], plane_b[0], deviation, significance]).astype(np.float32),
         scales=[{"colours": s.colours, "low": s.low, "high": s.high} for s in scales],
         units=units_words(units),
-        rms=_rms(apart),
+        rms=_rms(deviation),
         rms_noise=_rms(noise),
         rms_systematic=_rms(np.asarray(systematic)),
-        rms_over=_rms(over),
+        rms_over=_rms(significance),
     )
 
 
@@ -142,8 +142,8 @@ def product_values(product: Product, query: Any, window: Window) -> Measured:
         image = _image(product, window)
         values, gradient, *_ = _derived(image, name)
         lit = is_lit(image.values[0, 0], image.errors[0, 0])
-        shown = (np.where(lit, values, np.nan), np.sqrt(image.variance_of(gradient)))
-        return shown[0].reshape(window.shape).astype(np.float32), shown[1].reshape(window.shape).astype(np.float32)
+        planes = (np.where(lit, values, np.nan), np.sqrt(image.variance_of(gradient)))
+        return planes[0].reshape(window.shape).astype(np.float32), planes[1].reshape(window.shape).astype(np.float32)
     if name == "mueller":
         elements, errors = (
             window.every(product.get(dataset, window.rows)).reshape(16, *window.shape).astype(np.float32)
@@ -190,17 +190,17 @@ def _systematic_errors(first: Product, second: Product, query: Any, window: Wind
 def _shifts(product: Product, query: Any, window: Window) -> tuple[NDArray[np.floating] | None, NDArray[np.floating]]:
     """What each uncertain input of the instrument does to a map (D, rows, columns), if known, and their size."""
     name, index = queried_map(product, query)
-    moved = None
+    shifts = None
     if product.kind == "mueller" and (name == "mueller" or _is_derived(product, query)):
         systematic = Systematic.of_product(product)
         if systematic is not None:
             image = _image(product, window)
             slope = element_gradient(image, index) if name == "mueller" else _derived(image, name).gradient
-            moved = np.einsum("dixy,xyi->dxy", moves_of(systematic, image), slope).reshape(-1, *window.shape)
+            shifts = np.einsum("dixy,xyi->dxy", moves_of(systematic, image), slope).reshape(-1, *window.shape)
     elif f"{name}_directions" in product.names:
-        moved = window.every(product.get(f"{name}_directions", window.rows))
-    if moved is not None:
-        return moved, np.sqrt(np.square(moved).sum(axis=0))
+        shifts = window.every(product.get(f"{name}_directions", window.rows))
+    if shifts is not None:
+        return shifts, np.sqrt(np.square(shifts).sum(axis=0))
     if f"{name}_systematic" not in product.names:
         return None, np.zeros(window.shape)
     size = read_map(product, f"{name}_systematic", index, window)

@@ -176,13 +176,13 @@ class Diagnoses:
         if isinstance(story.diagnosis, SurfaceDiagnosis):
             material = load_reflectance(folder / "material.yaml")
             view = ViewingGeometry.load(folder / "geometry.yaml")
-            written = write_surface(path, story.diagnosis, material, view, instrument=model, note=note)
+            files = write_surface(path, story.diagnosis, material, view, instrument=model, note=note)
         else:
             write_instrument(path, model, story.diagnosis, note)
-            written = [path]
-        first, *companions = (path.name for path in written)
+            files = [path]
+        first, *companions = (path.name for path in files)
         self._decide(name, {"accepted": True, "file": first, "beside": companions, "note": note})
-        return written
+        return files
 
     def reject(self, name: str, note: str) -> None:
         """Note that the model is not believed, and why. Raises ProcessError where it is decided already."""

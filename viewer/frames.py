@@ -30,17 +30,17 @@ def capture(request: Request) -> HTMLResponse:
     pages, path = pages_of(request), file_of(request)
     library = pages.library
     entry = library.entry(library.name(path))
-    with Capture(path) as opened:
+    with Capture(path) as record:
         facts = [
-            *facts_of(opened),
-            ("begun", opened.start_time),
-            ("checksums", "every state is verified against them" if opened.checked else "none in the file"),
+            *facts_of(record),
+            ("begun", record.start_time),
+            ("checksums", "every state is verified against them" if record.checked else "none in the file"),
         ]
-        if segments := len(opened.segments) - 1:
+        if segments := len(record.segments) - 1:
             facts.append(("interrupted", f"{segments} time(s) and resumed"))
-        notes = papers_of(opened.header)
-        states = states_of(opened)
-        warnings = [str(message) for message in opened.closing.get("messages", [])]
+        notes = papers_of(record.header)
+        states = states_of(record)
+        warnings = [str(message) for message in record.closing.get("messages", [])]
     entries = library.entries()
     return pages.draw(
         "capture.html",
@@ -65,8 +65,8 @@ def capture(request: Request) -> HTMLResponse:
 def others(entry: Entry, entries: list[Entry]) -> list[Entry]:
     """Files of the same kind and mode, to compare with."""
     mode = None if entry.header is None else entry.header.mode
-    alike = [e for e in entries if e.kind == entry.kind and e is not entry]
-    return [e for e in alike if e.header is not None and e.header.mode == mode]
+    same_kind = [e for e in entries if e.kind == entry.kind and e is not entry]
+    return [e for e in same_kind if e.header is not None and e.header.mode == mode]
 
 
 def states_of(opened: Capture) -> dict[str, Any]:
@@ -93,18 +93,18 @@ def _plain(values: Any) -> list[float | None]:
 
 def states(request: Request) -> JSONResponse:
     """The states done by now, for a capture that is being written."""
-    with Capture(file_of(request)) as opened:
-        return JSONResponse(states_of(opened) | {"status": opened.status, "planned": opened.planned_states})
+    with Capture(file_of(request)) as record:
+        return JSONResponse(states_of(record) | {"status": record.status, "planned": record.planned_states})
 
 
 def frame(request: Request) -> Response:
     """Part of a frame: two pictures, mean counts and where a pixel is saturated (1, else 0)."""
     path, query = file_of(request), request.query_params
-    with Capture(path) as opened:
-        state, channel = chosen(opened, query)
-        window = Window.asked(query, opened.frame_shape)
-        counts = opened.frames(state, window.rows)[channel]
-        top = saturation(opened)
+    with Capture(path) as record:
+        state, channel = chosen(record, query)
+        window = Window.asked(query, record.frame_shape)
+        counts = record.frames(state, window.rows)[channel]
+        top = saturation(record)
     mean = window.mean(counts)
     red = np.zeros_like(mean) if top is None else window.largest(counts) >= top
     return sent(window, np.stack([mean, red.astype(np.float32)]), state=state)
@@ -113,11 +113,11 @@ def frame(request: Request) -> Response:
 def preview(request: Request) -> Response:
     """A frame as a small picture (PNG): what is seen until the page's script has drawn the one that can be zoomed."""
     path, query = file_of(request), request.query_params
-    with Capture(path) as opened:
-        state, channel = chosen(opened, query)
-        window = Window.asked({key: query[key] for key in ("most",) if key in query}, opened.frame_shape, most=PREVIEW)
-        counts = opened.frames(state)[channel]
-        top, black = saturation(opened), opened.header.detector.black_level_counts
+    with Capture(path) as record:
+        state, channel = chosen(record, query)
+        window = Window.asked({key: query[key] for key in ("most",) if key in query}, record.frame_shape, most=PREVIEW)
+        counts = record.frames(state)[channel]
+        top, black = saturation(record), record.header.detector.black_level_counts
     mean = window.mean(counts)
     high = float(np.nanmax(mean))
     grey = np.nan_to_num(np.clip((mean - black) / max(high - black, 1.0), 0, 1)) * 255
@@ -143,10 +143,10 @@ def chosen(opened: Capture, query: Any) -> tuple[int, int]:
 def histogram(request: Request) -> JSONResponse:
     """Pixels of a frame by their counts: edges of the bars, pixels in each, and where the range ends."""
     path, query = file_of(request), request.query_params
-    with Capture(path) as opened:
-        state, channel = chosen(opened, query)
-        counts = opened.frames(state)[channel]
-        top, black = saturation(opened), opened.header.detector.black_level_counts
+    with Capture(path) as record:
+        state, channel = chosen(record, query)
+        counts = record.frames(state)[channel]
+        top, black = saturation(record), record.header.detector.black_level_counts
     finite = counts[np.isfinite(counts)] if counts.dtype.kind == "f" else counts
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     if counts.dtype.kind in "ui":

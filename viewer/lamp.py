@@ -34,10 +34,10 @@ def lamp(capture: Capture) -> dict[str, Any]:
     if fitted is not None:
         method = "dark-corrected mean of each state over what polarization makes of it by the other states"
         return _lamp_entry(capture, light, signal / fitted, method)
-    same = _repeats(capture, light)
-    if same.sum() > 1:
-        method = f"dark-corrected mean of the {int(same.sum())} states that repeat the pose of the first one"
-        return _lamp_entry(capture, light[same], signal[same] / signal[same][0], method)
+    repeats = _repeats(capture, light)
+    if repeats.sum() > 1:
+        method = f"dark-corrected mean of the {int(repeats.sum())} states that repeat the pose of the first one"
+        return _lamp_entry(capture, light[repeats], signal[repeats] / signal[repeats][0], method)
     method = "shown once enough states separate the lamp from polarization"
     return {"states": [], "ratio": [], "told": method}
 
@@ -53,20 +53,20 @@ def _dark_corrected(capture: Capture, light: NDArray[np.int64]) -> NDArray[np.fl
     signal = monitor[light].copy()
     dark = capture.states_with("dark")
     for k, state in enumerate(light):
-        alike = dark[np.isclose(exposure_s[dark], exposure_s[state])]
-        if alike.size:
-            signal[k] -= monitor[alike].mean()
+        matching = dark[np.isclose(exposure_s[dark], exposure_s[state])]
+        if matching.size:
+            signal[k] -= monitor[matching].mean()
     return signal
 
 
 def _repeats(capture: Capture, light: NDArray[np.int64]) -> NDArray[np.bool_]:
     targets = capture.planned_targets_deg()
     exposure_s = capture.column("exposure_s")[light]
-    same = np.isclose(exposure_s, exposure_s[0])
+    is_same = np.isclose(exposure_s, exposure_s[0])
     for column in targets.values():
-        turned = np.abs(column[capture.done[light]] - column[capture.done[light[0]]]) % 360
-        same &= np.minimum(turned, 360 - turned) < 0.01
-    return np.asarray(same)
+        angle_deg = np.abs(column[capture.done[light]] - column[capture.done[light[0]]]) % 360
+        is_same &= np.minimum(angle_deg, 360 - angle_deg) < 0.01
+    return np.asarray(is_same)
 
 
 def _fitted(capture: Capture, light: NDArray[np.int64], signal: NDArray[np.float64]) -> NDArray[np.float64] | None:

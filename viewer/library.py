@@ -262,14 +262,14 @@ def inputs_of(entry: Entry, entries: list[Entry], root: Path) -> list[tuple[str,
 def input_of(identity: dict[str, Any], entries: list[Entry], root: Path) -> Entry | None:
     """The file in the folder that an input was: by what it was made of, by its path, or moved with its folder."""
     path, content = str(identity.get("path", "")), identity.get(MADE_OF)
-    if content is not None and (same := next((e for e in entries if e.content == content), None)):
-        return same
-    if same := next((e for e in entries if f"{root}/{e.name}" == path), None):
-        return same
+    if content is not None and (match := next((e for e in entries if e.content == content), None)):
+        return match
+    if match := next((e for e in entries if f"{root}/{e.name}" == path), None):
+        return match
     # A capture elsewhere: its content is read only where name and size are right.
     name, size = path.rpartition("/")[2], identity.get("bytes")
-    alike = (e for e in entries if e.kind == "capture" and e.size == size and e.name.rpartition("/")[2] == name)
-    return next((e for e in alike if _content(root / e.name, e.changed_s) == content_of(identity)), None)
+    candidates = (e for e in entries if e.kind == "capture" and e.size == size and e.name.rpartition("/")[2] == name)
+    return next((e for e in candidates if _content(root / e.name, e.changed_s) == content_of(identity)), None)
 
 
 @lru_cache(maxsize=4096)

@@ -81,12 +81,12 @@ def file_of(request: Request, name: str = "file") -> Path:
 
 async def fields_of(request: Request) -> dict[str, str]:
     """The texts that a page sends, as JSON. Raises ProcessError."""
-    sent = b""
+    body = b""
     async for part in request.stream():
-        sent += part
-        if len(sent) > MOST_SENT:
+        body += part
+        if len(body) > MOST_SENT:
             raise ProcessError(f"a page sends at most {MOST_SENT:,} bytes")
-    fields = parse_json(sent, "what the page sent")
+    fields = parse_json(body, "what the page sent")
     if not isinstance(fields, dict) or not all(isinstance(value, str) for value in fields.values()):
         raise ProcessError("a page sends named texts")
     return fields

@@ -126,15 +126,15 @@ def _planes(product: Product, region: Region) -> list[dict[str, Any]]:
         with np.errstate(invalid="ignore"):
             entry["value"] = finite(_mean(flat, period_deg(name, product.units(name))))
             if errors in product.names:
-                each = product.get(errors, region.rows)[..., region.columns].astype(float)
-                each = each.reshape(-1, *each.shape[-2:])
-                labels = np.zeros(each.shape[1:], int)
+                values_of = product.get(errors, region.rows)[..., region.columns].astype(float)
+                values_of = values_of.reshape(-1, *values_of.shape[-2:])
+                labels = np.zeros(values_of.shape[1:], int)
                 # An error that is not known leaves that of the mean unknown.
-                total = [shared_variance(labels, sigma, correlation).sum() + 0 * sigma.sum() for sigma in each]
+                total = [shared_variance(labels, sigma, correlation).sum() + 0 * sigma.sum() for sigma in values_of]
                 entry["error"] = finite(np.sqrt(total) / region.pixels)
             if f"{name}_systematic" in product.names:
-                each = product.get(f"{name}_systematic", region.rows)[..., region.columns]
-                entry["systematic"] = finite(each.reshape(-1, region.pixels).mean(axis=1, dtype=float))
+                values_of = product.get(f"{name}_systematic", region.rows)[..., region.columns]
+                entry["systematic"] = finite(values_of.reshape(-1, region.pixels).mean(axis=1, dtype=float))
         entries.append(entry)
     return entries
 
@@ -157,9 +157,9 @@ def capture_of(product: Product, library: Library) -> tuple[Path, Path | None] |
         return None
     path = Path(str(inputs["capture"].get("path")))
     if not library.holds(path):
-        moved = input_of(inputs["capture"], library.entries(), library.root)
-        if moved is None:
+        source = input_of(inputs["capture"], library.entries(), library.root)
+        if source is None:
             return None
-        path = library.root / moved.name
+        path = library.root / source.name
     instrument = Path(str(inputs["instrument"].get("path"))) if "instrument" in inputs else None
     return path, instrument if instrument is not None and instrument.exists() else None

@@ -143,7 +143,7 @@ def curve(reducer: PixelReducer, region: Region) -> dict[str, Any]:
     fitted = image.w @ image.values.reshape(16).astype(float)
     noise = np.sqrt(image.intensity_variance.reshape(-1).astype(float))
     residual = (intensities - fitted) / noise
-    free = max(len(fitted) - int(image.facts["rank"]), 1)
+    degrees_of_freedom = max(len(fitted) - int(image.facts["rank"]), 1)
     return {
         "states": np.repeat(reducer.reduction.states, channels).tolist(),
         "series": analyzer_names(reducer.channels) if channels > 1 else [""],
@@ -151,7 +151,7 @@ def curve(reducer: PixelReducer, region: Region) -> dict[str, Any]:
         "fitted": fitted.tolist(),
         "noise": finite(noise),
         "residual": finite(residual),
-        "chi_square": finite(np.sum(residual**2) / free),
+        "chi_square": finite(np.sum(residual**2) / degrees_of_freedom),
         "noise_known": bool(np.isfinite(image.noise_slope).all()),
         "told": reducer.told(region),
     }
@@ -162,25 +162,25 @@ def matrix(image: MuellerImage | ExtrapolatedImage) -> dict[str, Any]:
     measured = (image.seen if isinstance(image, MuellerImage) else np.ones(16, dtype=bool)).reshape(4, 4)
     m, errors = (np.where(measured, v.reshape(4, 4), np.nan).astype(float) for v in (image.values, image.errors))
     derived = quantities_block(image, (), {}) if measured.all() else {}
-    named = {name: values.reshape(-1).astype(float) for name, values in derived.items()}
+    values_of = {name: values.reshape(-1).astype(float) for name, values in derived.items()}
     with np.errstate(divide="ignore", invalid="ignore"):
         normalized = m / m[0, 0]
         # First order, with the covariance of an element and m00.
-        over = np.empty((4, 4))
+        errors_over_m00 = np.empty((4, 4))
         for i in range(4):
             for j in range(4):
                 gradient = np.zeros((1, 1, 16))
                 gradient[..., 4 * i + j] += 1 / m[0, 0]
                 gradient[..., 0] -= m[i, j] / m[0, 0] ** 2
-                over[i, j] = math.sqrt(max(float(image.variance_of(gradient).reshape(-1)[0]), 0.0))
+                errors_over_m00[i, j] = math.sqrt(max(float(image.variance_of(gradient).reshape(-1)[0]), 0.0))
     quantities = {
-        name: {"value": finite(values), "error": finite(named[f"{name}_errors"])}
-        for name, values in named.items()
-        if f"{name}_errors" in named and values.size <= 4
+        name: {"value": finite(values), "error": finite(values_of[f"{name}_errors"])}
+        for name, values in values_of.items()
+        if f"{name}_errors" in values_of and values.size <= 4
     }
     return {
         "mueller": finite(normalized),
-        "mueller_errors": finite(over),
+        "mueller_errors": finite(errors_over_m00),
         "m00": finite(m[0, 0]),
         "m00_error": finite(errors[0, 0]),
         "quantities": quantities,

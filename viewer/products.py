@@ -183,16 +183,16 @@ def read_mueller(
     m00 = elements[0].copy()
     with np.errstate(invalid="ignore", divide="ignore"):
         lit = is_lit(m00, stderr[0])
-        shown = np.asarray(stderr if errors else elements, dtype=np.float32)
+        image = np.asarray(stderr if errors else elements, dtype=np.float32)
         if normalized:
-            shown = shown / m00
-            shown[0] = stderr[0] / m00 if errors else m00
-    shown[1:, ~lit] = np.nan
+            image = image / m00
+            image[0] = stderr[0] / m00 if errors else m00
+    image[1:, ~lit] = np.nan
     name = "mueller_errors" if errors else "mueller"
-    scale = scale_of(name, "", shown[1:])
+    scale = scale_of(name, "", image[1:])
     if scale.colours == SIGNED and normalized:
         scale = ColourScale(SIGNED, max(scale.low, -1.0), min(scale.high, 1.0))
-    return shown, scale
+    return image, scale
 
 
 def units_words(units: str) -> str:

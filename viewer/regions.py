@@ -85,9 +85,9 @@ def _keep_region(library: Library, fields: dict[str, str]) -> JSONResponse:
     if not NAME.fullmatch(name):
         raise ProcessError("a region has a name of up to 40 letters, digits, spaces and signs . ( ) + - _")
     columns, rows = ((part.start, part.stop) for part in (place.columns, place.rows))
-    fresh = NamedRegion(name=name, columns=columns, rows=rows, image=shape)
+    new_region = NamedRegion(name=name, columns=columns, rows=rows, image=shape)
     with _lock:
-        by_name = {region.name: region for region in load_regions(library)} | {name: fresh}
+        by_name = {region.name: region for region in load_regions(library)} | {name: new_region}
         write_side_file(library, FILE, _RegionsFile(regions=list(by_name.values())))
     return JSONResponse({"name": name})
 
@@ -111,9 +111,9 @@ def regions(request: Request) -> JSONResponse:
     """One quantity of an image in the region that the request names by x0 and y0, and in every named one."""
     path, query = file_of(request), request.query_params
     image = MeasuredImage(path)
-    named = [("", Region.asked(query, image.shape))] if "x0" in query else []
-    named += _named_areas(pages_of(request).library, image.shape)
-    return JSONResponse({"regions": [image.row(name, region, query) for name, region in named]})
+    areas = [("", Region.asked(query, image.shape))] if "x0" in query else []
+    areas += _named_areas(pages_of(request).library, image.shape)
+    return JSONResponse({"regions": [image.row(name, region, query) for name, region in areas]})
 
 
 def table(request: Request) -> Response:
@@ -179,36 +179,36 @@ class MeasuredImage:
         if region.pixels > MOST:
             raise ProcessError(f"{region} is more than is read at once; draw a smaller one")
         pixels = self._pixels(region, query)
-        good = np.isfinite(pixels.values)
-        count = int(good.sum())
+        is_finite = np.isfinite(pixels.values)
+        count = int(is_finite.sum())
         (x0, x1), (y0, y1) = ((part.start, part.stop) for part in (region.columns, region.rows))
         row = {"name": name, "where": str(region), "x0": x0, "x1": x1, "y0": y0, "y1": y1, "pixels": count}
         row |= {"unit": units_words(pixels.units), "value": None, "error": None, "systematic": None, "spread": None}
         if not count:
             return row | {"histogram": {"edges": [], "pixels": []}, "columns": [], "rows": []}
-        mean = float(_mean(pixels.values[good], pixels.period, 0))
-        off = _wrap(pixels.values - mean, pixels.period)
-        value, error, systematic = pixels.mean or (mean, _error(pixels, good), _systematic(pixels, good))
-        edges = _edges(pixels.values[good] if pixels.period is None else mean + off[good])
+        mean = float(_mean(pixels.values[is_finite], pixels.period, 0))
+        deviation = _wrap(pixels.values - mean, pixels.period)
+        value, error, systematic = pixels.mean or (mean, _error(pixels, is_finite), _systematic(pixels, is_finite))
+        edges = _edges(pixels.values[is_finite] if pixels.period is None else mean + deviation[is_finite])
         return row | {
             "value": finite(value),
             "error": finite(error),
             "systematic": finite(systematic),
-            "spread": finite(off[good].std(ddof=1)) if count > 1 else None,
+            "spread": finite(deviation[is_finite].std(ddof=1)) if count > 1 else None,
             "histogram": {
                 "edges": edges.tolist(),
-                "pixels": np.histogram(mean + off[good], edges)[0].tolist(),
+                "pixels": np.histogram(mean + deviation[is_finite], edges)[0].tolist(),
             },
             "columns": finite(_mean(pixels.values, pixels.period, 0)),
             "rows": finite(_mean(pixels.values, pixels.period, 1)),
         }
 
     def _pixels(self, region: Region, query: Any) -> _Pixels:
-        window, alone = Window(region.rows, region.columns, 1), np.ones((1, 1))
+        window, uncorrelated = Window(region.rows, region.columns, 1), np.ones((1, 1))
         if not is_product(self._path):
             with Capture(self._path) as capture:
                 counts, errors = capture_values(capture, query, window)
-            return _Pixels(counts.astype(float), errors.astype(float), "count", None, alone)
+            return _Pixels(counts.astype(float), errors.astype(float), "count", None, uncorrelated)
         with Product(self._path) as product:
             name, index = queried_map(product, query)
             values, errors = product_values(product, query, window)
@@ -257,12 +257,12 @@ def _means(path: Path, changed: int, place: tuple[int, int, int, int]) -> dict[s
 
 def _mean(values: NDArray[np.float64], period: float | None, axis: int) -> NDArray[np.float64]:
     """Mean along an axis of what is finite; of orientations, that of 1 and 179 degrees is 0 and not 90."""
-    good = np.isfinite(values)
-    filled = np.where(good, values, 0)
+    is_finite = np.isfinite(values)
+    filled = np.where(is_finite, values, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         if period is None:
-            return np.asarray(filled.sum(axis=axis) / good.sum(axis=axis))
-        turns = np.where(good, np.exp(2j * np.pi * filled / period), 0).sum(axis=axis) / good.sum(axis=axis)
+            return np.asarray(filled.sum(axis=axis) / is_finite.sum(axis=axis))
+        turns = np.where(is_finite, np.exp(2j * np.pi * filled / period), 0).sum(axis=axis) / is_finite.sum(axis=axis)
     return np.asarray(np.angle(turns) / (2 * np.pi) * period % period)
 
 

@@ -18,8 +18,8 @@ from viewer.application import application
 def serve(folder: Path, port: int, browser: bool) -> None:
     """Serve a folder until Ctrl-C; prints the address. Raises ProcessError where folder or port cannot be had."""
     if not folder.is_dir():
-        why = "is a file, and no folder" if folder.exists() else "no such folder"
-        raise ProcessError(f"{folder}: {why}. `view FOLDER` shows what is in it.")
+        reason = "is a file, and no folder" if folder.exists() else "no such folder"
+        raise ProcessError(f"{folder}: {reason}. `view FOLDER` shows what is in it.")
     token = secrets.token_urlsafe(18)
     try:
         listener = socket.create_server(("127.0.0.1", port), backlog=64)
@@ -30,8 +30,8 @@ def serve(folder: Path, port: int, browser: bool) -> None:
     typer.echo("Ctrl-C ends it; runs started from the page continue.", err=True)
     sys.stdout.flush()
     # A browser that never asks holds a connection; those who ask must find one more.
-    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most if most != resource.RLIM_INFINITY else 1 << 16, most))
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (limit if limit != resource.RLIM_INFINITY else 1 << 16, limit))
     way_in = _open_in_browser(address) if browser else None
     # Addresses hold the token, so no request is ever logged.
     settings = uvicorn.Config(

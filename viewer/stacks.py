@@ -44,7 +44,7 @@ def stack(request: Request) -> HTMLResponse:
         with Product(pages.library.path(entries[0].name)) as product:
             choices = choices_of(product)
     varied = {name: len({_place(entry)[name] for entry in entries}) for name in ("omega", "nm", "sample")}
-    most = max(varied, key=lambda name: varied[name])
+    most_varied = max(varied, key=lambda name: varied[name])
     return pages.draw(
         "stack.html",
         simulated=any(entry.simulated for entry in entries),
@@ -57,7 +57,7 @@ def stack(request: Request) -> HTMLResponse:
         places=[MIDDLE, *(region.name for region in load_regions(pages.library))],
         axes=AXES,
         # Without anything that differs these are repeats.
-        over=most if varied[most] > 1 else "time",
+        over=most_varied if varied[most_varied] > 1 else "time",
     )
 
 
@@ -102,9 +102,9 @@ def _place(entry: Entry) -> dict[str, Any]:
 def _points(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
     """A point for each product, and why others have none."""
     pages, query = pages_of(request), request.query_params
-    named = {area.name: area for area in load_regions(pages.library)}
+    area_of = {area.name: area for area in load_regions(pages.library)}
     where = query.get("region", MIDDLE)
-    if where != MIDDLE and where not in named:
+    if where != MIDDLE and where not in area_of:
         raise NotHere(f"{where}: there is no such region")
     name, index, label = query.get("name", ""), query.get("index", "0"), query.get("label", "")
     points: list[dict[str, Any]] = []
@@ -113,7 +113,7 @@ def _points(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
         path = pages.library.path(entry.name)
         try:
             image, time = _open_image(path, path.stat().st_mtime_ns)
-            region = Region(*parse_region(None, image.shape)) if where == MIDDLE else named[where].on(image.shape)
+            region = Region(*parse_region(None, image.shape)) if where == MIDDLE else area_of[where].on(image.shape)
             if region is None:
                 reasons.append(f"the image has another form than region {where}")
                 continue

@@ -103,8 +103,8 @@ def resume_preview(folder: Path) -> tuple[str, list[str]] | None:
         rig = load_rig(command[command.index("--rig") + 1])
     except ProcessError:
         return None
-    named = [rig.alert, rig.notify.command if rig.notify else (), (rig.notify and rig.notify.webhook) or ""]
-    return shlex.join(command), [entry if isinstance(entry, str) else shlex.join(entry) for entry in named if entry]
+    commands = [rig.alert, rig.notify.command if rig.notify else (), (rig.notify and rig.notify.webhook) or ""]
+    return shlex.join(command), [entry if isinstance(entry, str) else shlex.join(entry) for entry in commands if entry]
 
 
 def _reduce(library: Library, jobs: Jobs, fields: dict[str, str]) -> PageJob:

@@ -53,8 +53,8 @@ def _free_name(folder: Path, model: str) -> str:
 
 def _residual_entry(residual: StoredResidual) -> dict[str, Any]:
     rows, columns = residual.images["before"].shape[-2:]
-    loud = [_rms(residual, moment) for moment in MOMENTS]
-    valid = np.concatenate([image[np.isfinite(image)] for image in loud])
+    rms_images = [_rms(residual, moment) for moment in MOMENTS]
+    valid = np.concatenate([image[np.isfinite(image)] for image in rms_images])
     return {
         "name": residual.name,
         "shape": [rows, columns],
@@ -76,13 +76,13 @@ def residual_map(request: Request) -> Response:
     window = Window.asked(query, residual.images["before"].shape[-2:])
     state = query.get("state")
     try:
-        shown = [
+        images = [
             _rms(residual, m) if state is None else residual.images[m][int(state)].astype(np.float32) for m in MOMENTS
         ]
     except (ValueError, IndexError) as error:
         raise ProcessError(f"there is no state {state} in this diagnosis") from error
     colours = PLAIN if state is None else SIGNED
-    pictures = np.stack([window.every(image[window.rows]) for image in shown])
+    pictures = np.stack([window.every(image[window.rows]) for image in images])
     return sent(window, pictures, colours=colours, units="noise of one intensity")
 
 
@@ -112,8 +112,8 @@ async def decide(request: Request) -> JSONResponse:
     fields, diagnoses = await fields_of(request), diagnoses_of(request)
     name, note = fields.get("name", ""), fields.get("note", "")
     if fields.get("accept"):
-        written = await run_in_threadpool(diagnoses.accept, name, fields.get("file", ""), note)
-        return JSONResponse({"files": [path.name for path in written]})
+        files = await run_in_threadpool(diagnoses.accept, name, fields.get("file", ""), note)
+        return JSONResponse({"files": [path.name for path in files]})
     diagnoses.reject(name, note)
     return JSONResponse({"files": []})
 

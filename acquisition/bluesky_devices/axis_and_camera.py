@@ -29,8 +29,8 @@ class AxisDevice(BlueskyDevice):
     target_deg: float | None = None
 
     def _configuration(self) -> dict[str, tuple[Any, str]]:
-        who = self.rig.axes[self.name].describe()
-        return {"serial_number": (who.serial_number, ""), "model": (who.model, "")}
+        identity = self.rig.axes[self.name].describe()
+        return {"serial_number": (identity.serial_number, ""), "model": (identity.model, "")}
 
     def set(self, value: float) -> MoveStatus:
         """Go to an angle, degrees. The status fails if it is forbidden, out of limits, or not reached."""
@@ -77,11 +77,11 @@ class CameraDevice(BlueskyDevice):
 
     def _configuration(self) -> dict[str, tuple[Any, str]]:
         camera = self.rig.require_camera()
-        who = camera.describe()
+        identity = camera.describe()
         configuration = {
             "exposure_s": (self.exposure_s, "s"),
-            "serial_number": (who.serial_number, ""),
-            "model": (who.model, ""),
+            "serial_number": (identity.serial_number, ""),
+            "model": (identity.model, ""),
         }
         gain_db = None if camera.configured is None else camera.configured.gain_db
         return configuration | ({} if gain_db is None else {"gain_db": (gain_db, "dB")})

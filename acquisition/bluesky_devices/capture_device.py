@@ -125,12 +125,12 @@ class CaptureDevice(BlueskyDevice):
         return before, self.read_configuration()
 
     def _configuration(self) -> dict[str, tuple[Any, str]]:
-        who = self.rig.require_camera().describe()
+        identity = self.rig.require_camera().describe()
         configuration: dict[str, tuple[Any, str]] = {
             "mode": (self.plan.mode, ""),
             "sample": (self.plan.sample.name or self.plan.sample.kind, ""),
             "wavelength_nm": (self.plan.wavelength_nm, "nm"),
-            "camera_serial_number": (who.serial_number, ""),
+            "camera_serial_number": (identity.serial_number, ""),
         }
         exposure_s = self._number("exposure_s")
         return configuration | ({} if math.isnan(exposure_s) else {"plan_exposure_s": (exposure_s, "s")})

@@ -169,13 +169,13 @@ def captures(campaign: Campaign) -> Iterator[CampaignCapture]:
                         due = index == 0 or (reference.every is not None and index % reference.every == 0)
                         if due and mode in reference.modes:
                             number += 1
-                            chosen = plan.with_changes(
+                            reference_plan = plan.with_changes(
                                 **common,
                                 sample=reference.sample,
                                 omega_deg=reference.omega_deg,
                                 role=reference.role,
                             )
-                            yield _capture(number, chosen, True)
+                            yield _capture(number, reference_plan, True)
                     number += 1
                     yield _capture(number, plan.with_changes(**common, sample=sample, omega_deg=omega), False)
 

@@ -165,7 +165,7 @@ class CampaignRun:
                 return None
             done = self._states_done(capture)
             try:
-                ended = False
+                is_over = False
                 rig = self._open_rig()
                 selects = rig.source is not None and rig.source.selects_wavelength
                 changed = self.operator.prepare(capture.plan, source_selects=selects)
@@ -173,11 +173,11 @@ class CampaignRun:
                 self.folder.record(capture.name, status="running", reference=capture.reference)
                 self._wait_for_door(rig, capture)
                 result = self._take_once(capture, job, rig)
-                ended = True
+                is_over = True
             except Stopped:
                 return None
             except Exception as unknown:
-                error, ended = as_run_error(unknown), True
+                error, is_over = as_run_error(unknown), True
                 # A capture that got further was worth going on with: only tries without progress are counted.
                 failures = failures + 1 if self._states_done(capture) <= done else 1
                 self.folder.log(
@@ -195,7 +195,7 @@ class CampaignRun:
                 self._pause(self.campaign.retry_wait_s)
                 continue
             finally:
-                if not ended and self.folder.index.get(capture.name, {}).get("status") == "running":
+                if not is_over and self.folder.index.get(capture.name, {}).get("status") == "running":
                     self.folder.record(capture.name, status="stopped")
             self.folder.log(
                 "capture ended", capture=capture.name, status=result.status, states=result.states_done,

@@ -34,12 +34,12 @@ def brightest_states(table: StateTable, instrument: InstrumentModel, sample: str
     w = instrument.rows(angles, changes_at(instrument, angles)).max(axis=1)
     ideal = {"air": [np.eye(4)], "mirror": [mueller.IDEAL_MIRROR]}
     samples = ideal.get(sample, [mueller.IDEAL_DEPOLARIZER, np.eye(4), mueller.IDEAL_MIRROR])
-    chosen: list[int] = []
+    probes: list[int] = []
     for matrix in samples:
         for k in np.argsort(-(w @ np.asarray(matrix).ravel()))[:PROBES_EACH]:
-            if light[int(k)] not in chosen:
-                chosen.append(light[int(k)])
-    return chosen
+            if light[int(k)] not in probes:
+                probes.append(light[int(k)])
+    return probes
 
 
 def find_exposure(

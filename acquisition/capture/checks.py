@@ -127,7 +127,7 @@ def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) 
     light = [k for k, role in enumerate(table.role) if role != "dark"]
     angles = {axis: table.angles_deg[axis][light] for axis in instrument.axes}
     # A mosaic before which nothing turns measures one linear Stokes vector.
-    if angles and (instrument.mosaic is None or any(np.ptp(turned) > 0 for turned in angles.values())):
+    if angles and (instrument.mosaic is None or any(np.ptp(column_deg) > 0 for column_deg in angles.values())):
         w = instrument.rows(angles, changes_at(instrument, angles))
         basis = determined_basis(instrument)
         r, full_rank = rank(w), basis.shape[1]
@@ -199,9 +199,9 @@ def check_devices(
 
 
 def _check_first_move(table: StateTable, rig: Rig, state: int, here_deg: Mapping[str, float]) -> CheckResult:
-    by = states_deg(turned(table, turns_to(table, rig, state, here_deg, preferred={})))
-    if find_way(rig.config, here_deg, by[state], by, limits=rig.limits, first=ARM) is None:
-        obstacle = find_obstacle(rig.config, here_deg, {**here_deg, **by[state]}, by[state], limits=rig.limits)
+    poses = states_deg(turned(table, turns_to(table, rig, state, here_deg, preferred={})))
+    if find_way(rig.config, here_deg, poses[state], poses, limits=rig.limits, first=ARM) is None:
+        obstacle = find_obstacle(rig.config, here_deg, {**here_deg, **poses[state]}, poses[state], limits=rig.limits)
         return CheckResult("first move", False, f"to state {state} it meets {obstacle}, and there is no way round it")
     return CheckResult("first move", True, f"free to state {state}")
 

@@ -61,10 +61,10 @@ class FrameChecks:
         FrameLost
         """
         request = f"camera, frame of state {state}"
-        again = self.evidence.repeats(frame.pixels)
+        repetition = self.evidence.repeats(frame.pixels)
         rig.last_frame = frame.pixels
-        if again is not None:
-            raise FrameLost(request, again, "Switch the camera off and on")
+        if repetition is not None:
+            raise FrameLost(request, repetition, "Switch the camera off and on")
         applied = rig.require_camera().applied()
         # The exposure is that of the state; all else as at the first frame, not as another program left it meanwhile.
         self._began_with = self._began_with or settings
@@ -136,10 +136,10 @@ class FrameChecks:
         changed = self._repeated.look(report.state, planned_s, pose, report.pixels)
         if changed is not None:
             self._warn(changed)
-        wrong = self._lit_darks.light(planned_s, pose, report.pixels)
-        if wrong is not None:
+        problem = self._lit_darks.light(planned_s, pose, report.pixels)
+        if problem is not None:
             raise RunFailed(
-                f"state {report.state}: {wrong}. The light was not shut off for them, or the black level is wrong. "
+                f"state {report.state}: {problem}. The light was not shut off for them, or the black level is wrong. "
                 "Make sure that the source darkens the sample, or correct detector.black_level_counts in the rig file, "
                 "and begin the capture again."
             )

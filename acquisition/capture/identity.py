@@ -79,8 +79,8 @@ def files_of(config: RigConfig, mode: str) -> dict[str, str]:
     tree.pop("wire_log", None)
     digests: dict[str, str] = {}
     for key, path in _paths(tree, ""):
-        named = ((f"{key}.{name}", file) for name, file in named_files(path))
-        for name, file in ((key, path), *named):
+        nested = ((f"{key}.{name}", file) for name, file in named_files(path))
+        for name, file in ((key, path), *nested):
             if os.path.isfile(file):
                 digests[name] = hashlib.sha256(file.read_bytes()).hexdigest()
     return digests

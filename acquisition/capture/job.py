@@ -76,8 +76,8 @@ def prepare(plan: MeasurementPlan, rig: RigConfig, read: ReadInstrument = Instru
     checks = check_plan(plan, rig)
     refuse_failed(checks)
     instrument = load_instrument(plan, rig, read)
-    chosen = plan.exposure_s if isinstance(plan.exposure_s, float) else plan.exposure_s.start_s
-    table = plan.state_table(standing_pose_deg(plan, rig), chosen, rig.named_states())
+    exposure_s = plan.exposure_s if isinstance(plan.exposure_s, float) else plan.exposure_s.start_s
+    table = plan.state_table(standing_pose_deg(plan, rig), exposure_s, rig.named_states())
     checks += check_table(table, rig, instrument)
     refuse_failed(checks)
     seed = rig.simulator.seed if rig.simulator else None
@@ -187,9 +187,9 @@ def _require_same_targets(path: Path, job: Job, targets: Mapping[str, NDArray[np
         stored, period = targets.get(axis), float(job.rig.fold_deg.get(axis, 360))
         if stored is None or stored.shape != planned.shape:
             raise AcquisitionError(f"{path} is damaged: it has not the targets of axis {axis} that its plan asks for.")
-        off = np.abs((stored - planned + period / 2) % period - period / 2)
-        if not np.all(off < 1e-6):
-            state = int(np.argmin(off < 1e-6))
+        difference = np.abs((stored - planned + period / 2) % period - period / 2)
+        if not np.all(difference < 1e-6):
+            state = int(np.argmin(difference < 1e-6))
             raise AcquisitionError(
                 f"{path} is damaged: state {state} has axis {axis} at {stored[state]:g} deg, its plan at "
                 f"{planned[state]:g} deg. Nothing was moved. Begin the capture again: acquire --resume FILE --as-new"

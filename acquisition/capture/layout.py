@@ -96,5 +96,5 @@ def _pieces(memory: int, overlap: int = 0) -> list[tuple[int, bytes]]:
 def write_whole(file: int, offset: int, raw: memoryview) -> None:
     """Write all bytes at a place, however many calls that takes. Raises OSError."""
     while raw:
-        written = os.pwrite(file, raw, offset)
-        raw, offset = raw[written:], offset + written
+        count = os.pwrite(file, raw, offset)
+        raw, offset = raw[count:], offset + count

@@ -17,20 +17,20 @@ def match_mosaic(instrument: InstrumentModel, camera: Camera) -> InstrumentModel
         the frames hold parts of super-pixels, the camera names the analyzers otherwise than the instrument,
         or sends a mosaic that the instrument has not.
     """
-    settings, who = camera.settings, camera.describe()
-    if instrument.mosaic is None and who.polarized:
+    settings, identity = camera.settings, camera.describe()
+    if instrument.mosaic is None and identity.polarized:
         raise AcquisitionError(
-            f"pixel format {who.pixel_format} is that of a polarization sensor, and the instrument file has no mosaic, "
-            "as if its pixels saw through no polarizer. Lay the analyzers out as `mosaic` there (see "
+            f"pixel format {identity.pixel_format} is that of a polarization sensor, and the instrument file has no "
+            "mosaic, as if its pixels saw through no polarizer. Lay the analyzers out as `mosaic` there (see "
             "mosaic_polarimeter.yaml), or use another camera for this mode"
         )
-    if instrument.mosaic is None and not who.colours:
+    if instrument.mosaic is None and not identity.colours:
         return instrument
-    wrong = _phase_problem(settings, camera.bins_like_with_like)
+    problem = _phase_problem(settings, camera.bins_like_with_like)
     if instrument.mosaic is not None:
-        wrong = wrong or _size_problem(instrument.mosaic, settings) or _name_problem(instrument.mosaic, who)
-    if wrong is not None:
-        raise AcquisitionError(wrong)
+        problem = problem or _size_problem(instrument.mosaic, settings) or _name_problem(instrument.mosaic, identity)
+    if problem is not None:
+        raise AcquisitionError(problem)
     if instrument.mosaic is None:
         return instrument
     rows, columns = len(instrument.mosaic), len(instrument.mosaic[0])
@@ -46,17 +46,17 @@ def colours_of(instrument: InstrumentModel, camera: Camera) -> tuple[tuple[str, 
 
     On a polarization sensor each colour covers a whole super-pixel.
     """
-    who, settings = camera.describe(), camera.settings
-    if not who.colours:
+    identity, settings = camera.describe(), camera.settings
+    if not identity.colours:
         return None
-    each = 1 if instrument.mosaic is None else 2
-    rows, columns = 2 * each, 2 * each
+    size = 1 if instrument.mosaic is None else 2
+    rows, columns = 2 * size, 2 * size
     top, left = settings.offset_y or 0, settings.offset_x or 0
     # The second row holds green on the other diagonal, and the colour that is not in the first.
-    below = {"RG": "GB", "GR": "BG", "GB": "RG", "BG": "GR"}[who.colours]
-    sensor = [[_COLOURS[letter] for letter in line] for line in (who.colours, below)]
+    second_row = {"RG": "GB", "GR": "BG", "GB": "RG", "BG": "GR"}[identity.colours]
+    sensor = [[_COLOURS[letter] for letter in line] for line in (identity.colours, second_row)]
     return tuple(
-        tuple(sensor[(top + r) % rows // each][(left + c) % columns // each] for c in range(columns))
+        tuple(sensor[(top + r) % rows // size][(left + c) % columns // size] for c in range(columns))
         for r in range(rows)
     )
 

@@ -181,9 +181,9 @@ class MeasurementPlan(FiniteSection):
 
     def with_changes(self, **changes: Any) -> "MeasurementPlan":
         """A copy with the values that are not None, validated again. Raises ConfigError."""
-        chosen = {name: value for name, value in changes.items() if value is not None}
+        values = {name: value for name, value in changes.items() if value is not None}
         try:
-            return MeasurementPlan.model_validate(self.model_dump() | chosen)
+            return MeasurementPlan.model_validate(self.model_dump() | values)
         except ValidationError as error:
             lines = [": ".join(filter(None, (".".join(map(str, e["loc"])), words_of(e)))) for e in mistakes_of(error)]
             raise ConfigError("\n".join(lines)) from error

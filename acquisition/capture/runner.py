@@ -240,8 +240,8 @@ class CaptureRunner:
         return self._expose(state, targets, positions)
 
     def _move_s(self, axis: str, target_deg: float) -> float:
-        here_deg = self._pose_deg.get(axis)
-        return 0.0 if here_deg is None else self.rig.axes[axis].move_time_s(target_deg - here_deg)
+        start_deg = self._pose_deg.get(axis)
+        return 0.0 if start_deg is None else self.rig.axes[axis].move_time_s(target_deg - start_deg)
 
     def _expose(self, state: int, targets: Mapping[str, float], moved: dict[str, Position]) -> _Exposed | None:
         retake = self._retakes.get(state, 0)
@@ -259,7 +259,7 @@ class CaptureRunner:
             try:
                 exposure = camera.trigger()
                 # Axes that stood still are read while the light is collected: it costs no time.
-                still = {axis: self.rig.axes[axis].read_position() for axis in targets if axis not in moved}
+                resting = {axis: self.rig.axes[axis].read_position() for axis in targets if axis not in moved}
                 exposure.wait_exposed()
             except FrameLost as error:
                 self._retake(state, error)
@@ -274,7 +274,7 @@ class CaptureRunner:
             self.warn(f"state {state} is taken again")
             self._pending.appendleft(state)
             return None
-        positions = moved | still
+        positions = moved | resting
         self._require_on_target(state, targets, positions)
         # Looked at after the exposure: it also tells of an interlock that was open before it.
         temperature_c = camera.temperature_c()
@@ -361,8 +361,8 @@ class CaptureRunner:
             before, start = self._rested.get(axis), motion.start
             if before is None or start is None:
                 continue
-            off, unit = start.deg - before.deg, self.rig.axes[axis].config.unit
-            if abs(off) > self.rig.axes[axis].config.tolerance_deg:
+            difference, unit = start.deg - before.deg, self.rig.axes[axis].config.unit
+            if abs(difference) > self.rig.axes[axis].config.tolerance_deg:
                 raise RunFailed(
                     f"state {state}: axis {axis} rested at {before.deg:.4f} {unit} in the state before and reads "
                     f"{start.deg:.4f} {unit} before its next move: its controller restarted, or something turned it. "
@@ -383,8 +383,8 @@ class CaptureRunner:
 
     def _require_on_target(self, state: int, targets: Mapping[str, float], positions: Mapping[str, Position]) -> None:
         for axis, target in targets.items():
-            off, unit = positions[axis].deg - target, self.rig.axes[axis].config.unit
-            if abs(off) > self.rig.axes[axis].config.tolerance_deg:
+            difference, unit = positions[axis].deg - target, self.rig.axes[axis].config.unit
+            if abs(difference) > self.rig.axes[axis].config.tolerance_deg:
                 raise RunFailed(
                     f"state {state}: axis {axis} should stand at {target:.4f} {unit} and reads "
                     f"{positions[axis].deg:.4f} {unit} after it had arrived. Something moved it; the state is not kept."

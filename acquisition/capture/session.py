@@ -121,9 +121,9 @@ def _history(
                 "region of its first run."
             )
         require_same_devices(capture, *devices)
-        look, wrong = seen_so_far(capture, lights)
-        if wrong is not None:
-            raise AcquisitionError(f"{partial}: {wrong}. It cannot be resumed: begin the capture again.")
+        look, problem = seen_so_far(capture, lights)
+        if problem is not None:
+            raise AcquisitionError(f"{partial}: {problem}. It cannot be resumed: begin the capture again.")
         return Earlier(set(capture.done.tolist()), len(capture.segments), light_so_far(capture), look)
 
 
@@ -193,9 +193,9 @@ def _run(
     light = run_all([("shut off the light", _shut(rig))])
     if light is not None:
         runner.warn(f"the light could not be shut off: {light}")
-    judged = run_all([("judge the frames", runner.checks.judge)])
-    if judged is not None:
-        runner.warn(f"the frames could not be compared: {judged}")
+    failed_check = run_all([("judge the frames", runner.checks.judge)])
+    if failed_check is not None:
+        runner.warn(f"the frames could not be compared: {failed_check}")
     closing, path = _end_segment(runner, rig, status, failure)
     fault = run_all([("tell of the end", partial(observer.run_ended, status, closing)) for observer in watchers])
     if fault is not None and failure is None:
@@ -322,9 +322,9 @@ def _read_back(path: Path, targets_deg: dict[str, Array]) -> tuple[int, float, f
     """States done, largest part of saturated pixels, and largest angle off a target."""
     with Capture(path) as capture:
         saturated = capture.column("saturated_fraction")
-        off = [
+        differences = [
             # A part of the states may have been taken some turns away.
             np.abs((capture.angles_deg[axis] - target[capture.done] + 180.0) % 360.0 - 180.0)
             for axis, target in targets_deg.items()
         ]
-        return len(capture.done), float(np.max(saturated, initial=0.0)), float(np.max(off, initial=0.0))
+        return len(capture.done), float(np.max(saturated, initial=0.0)), float(np.max(differences, initial=0.0))

@@ -60,11 +60,11 @@ def _length_at(file: int, dataset: h5py.Dataset) -> int:
     """At which byte the length of a text stands. Raises ValueError where it is not found."""
     header = h5py.h5o.get_info(dataset.id).addr
     version, size = struct.unpack("<B7xI", os.pread(file, 12, header))
-    at, end = header + PREFIX, header + PREFIX + size
-    while version == 1 and at < end:
-        kind, size = struct.unpack("<HH", os.pread(file, 4, at))
-        first, length = struct.unpack("<B3xI", os.pread(file, 8, at + MESSAGE))
+    position, end = header + PREFIX, header + PREFIX + size
+    while version == 1 and position < end:
+        kind, size = struct.unpack("<HH", os.pread(file, 4, position))
+        first, length = struct.unpack("<B3xI", os.pread(file, 8, position + MESSAGE))
         if kind == DATATYPE and first == FIXED_TEXT and length == dataset.dtype.itemsize:
-            return int(at + MESSAGE + 4)
-        at += MESSAGE + size
+            return int(position + MESSAGE + 4)
+        position += MESSAGE + size
     raise ValueError(f"the length of {dataset.name} stands where this program does not look for it")

@@ -267,9 +267,9 @@ class CaptureWriter:
         )
 
     def _failure(self, error: BaseException) -> AcquisitionError:
-        why = str(error) or type(error).__name__
+        reason = str(error) or type(error).__name__
         return AcquisitionError(
-            f"{self.path} could not be written ({why}). States done before it are intact; "
+            f"{self.path} could not be written ({reason}). States done before it are intact; "
             "continue with --resume when the disc works again."
         )
 

@@ -53,8 +53,8 @@ def doctor(
             findings.append(finding)
             status.update(f"looking at the rig: {escape(shown(finding.title))} done")
     print_rows(finding.row for finding in findings)
-    if wrong := [finding.title for finding in findings if finding.well is False]:
-        typer.echo(f"not as it should be: {', '.join(wrong)}", err=True)
+    if faults := [finding.title for finding in findings if finding.well is False]:
+        typer.echo(f"not as it should be: {', '.join(faults)}", err=True)
         raise typer.Exit(1)
 
 

@@ -61,8 +61,8 @@ def _run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Ob
         refuse_failed(checks)
         return 0
     refuse_failed(checks)
-    held = CampaignFolder(folder, campaign)
-    held.begin_with(identity)
+    books = CampaignFolder(folder, campaign)
+    books.begin_with(identity)
     note_campaign(folder, file, rig_file)
     try:
         operator = Operator(partial(say, console), stop, options.yes, rig_config.simulated)
@@ -75,13 +75,13 @@ def _run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Ob
             watchers = [ConsoleProgress(console), run_file, notifier, *page, *observers]
             try:
                 done = CampaignRun(
-                    campaign, rig_config, held, operator, stop=stop, observers=watchers, home=options.home
+                    campaign, rig_config, books, operator, stop=stop, observers=watchers, home=options.home
                 ).run(jobs)
             finally:
-                lines = _sum_up(held, [capture.name for capture, _ in jobs])
+                lines = _sum_up(books, [capture.name for capture, _ in jobs])
             notifier.tell("end", lines[0] if done else f"stopped: {lines[0]}", summary=lines)
     finally:
-        held.close()
+        books.close()
     typer.echo("\n".join(lines))
     typer.echo(f"in {folder}: captures, {SUMMARY}, {INDEX}, {LOG}")
     words = ["process", "campaign", str(folder), "--geometry", "FILE", "--material", "FILE"]

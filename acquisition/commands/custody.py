@@ -61,18 +61,18 @@ def _load_captures(folder: Path) -> list[CampaignCapture]:
 
 def _index(folder: Path) -> Iterator[Finding]:
     try:
-        planned = _load_captures(folder)
+        campaign = _load_captures(folder)
     except ProcessError as error:
         yield Finding(PLAN, False, str(error))
         return
     index = read_index(folder)
-    names = {capture.name for capture in planned}
-    wrong = []
-    for capture in planned:
+    names = {capture.name for capture in campaign}
+    stale = []
+    for capture in campaign:
         path = folder / capture.name
         entry = index.get(capture.name, {})
         try:
-            wrong += [capture.name] if path.exists() and entry_of(capture, path) != entry else []
+            stale += [capture.name] if path.exists() and entry_of(capture, path) != entry else []
         except CaptureError:
             # Named above.
             continue
@@ -83,7 +83,7 @@ def _index(folder: Path) -> Iterator[Finding]:
             path.name.endswith(NEW) or _is_capture(path)
         ):
             yield Finding(path.name, None, "is no capture of this campaign")
-    yield Finding(INDEX, not wrong, "as the files are" if not wrong else f"differs for {', '.join(wrong)}; repair")
+    yield Finding(INDEX, not stale, "as the files are" if not stale else f"differs for {', '.join(stale)}; repair")
 
 
 def repair(folder: Path) -> Iterator[Finding]:
@@ -98,7 +98,7 @@ def repair(folder: Path) -> Iterator[Finding]:
         Another program runs the campaign in the folder.
     """
     campaign = load_yaml(folder / PLAN, Campaign) if (folder / PLAN).exists() else None
-    held = CampaignFolder(folder, campaign) if campaign is not None else None
+    books = CampaignFolder(folder, campaign) if campaign is not None else None
     try:
         for path in sorted(folder.iterdir()):
             if path.name.endswith(NEW):
@@ -106,11 +106,11 @@ def repair(folder: Path) -> Iterator[Finding]:
                 yield Finding(path.name, True, "removed")
             elif _is_capture(path):
                 yield _repair_capture(path)
-        if held is not None:
-            yield from _rebuild_index(held)
+        if books is not None:
+            yield from _rebuild_index(books)
     finally:
-        if held is not None:
-            held.close()
+        if books is not None:
+            books.close()
 
 
 def compressed(folder: Path) -> Iterator[Finding]:

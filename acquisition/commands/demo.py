@@ -43,8 +43,8 @@ def demo(
     seed = random.randrange(10_000) if seed is None else seed
     err, console = Console(stderr=True), Console(highlight=False, soft_wrap=True)
     folder = out / f"{datetime.datetime.now():%Y%m%d-%H%M%S}_seed{seed}"
-    again = "".join([f" --faults {faults}" if faults != 2 else "", *(f" --only {kind}" for kind in only or [])])
-    console.print(f"SIMULATED. Seed {seed}; repeat with ./lab demo --seed {seed}{again}", style="bold")
+    options = "".join([f" --faults {faults}" if faults != 2 else "", *(f" --only {kind}" for kind in only or [])])
+    console.print(f"SIMULATED. Seed {seed}; repeat with ./lab demo --seed {seed}{options}", style="bold")
 
     def say(line: str) -> None:
         console.print(line, style="green" if line.startswith("./lab") else "", markup=False)

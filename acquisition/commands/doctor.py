@@ -109,7 +109,7 @@ def _instrument(path: Path) -> str:
 
 def describe_axis(axis: MotionAxis) -> str:
     """An axis in a line: who it is, where it stands, its limits, speed and warnings. Raises DeviceError."""
-    who = axis.describe()
+    identity = axis.describe()
     limits = axis.limits
     ends = "limits " + " to ".join("none" if end is None else f"{end:g}" for end in (limits.min_deg, limits.max_deg))
     if limits.min_deg is None and limits.max_deg is None:
@@ -120,25 +120,25 @@ def describe_axis(axis: MotionAxis) -> str:
     position = f"at {axis.read_position().deg:.4f} {axis.config.unit}, " if axis.is_homed() else ""
     warnings = "".join(f", warning: {text}" for text in axis.warnings())
     stop = "" if axis.can_stop_a_move else ", cannot be stopped once it moves"
-    name = f"{who.kind} {who.model}, serial {who.serial_number}, firmware {who.firmware}"
+    name = f"{identity.kind} {identity.model}, serial {identity.serial_number}, firmware {identity.firmware}"
     if axis.config.unit == "V":
-        return f"{name}, {who.port}: {position}{ends}{warnings}"
+        return f"{name}, {identity.port}: {position}{ends}{warnings}"
     # As `process design --speed` wants it.
     speed = f"{axis.speed_deg_s:.4g}:{axis.acceleration_deg_s2:.4g} deg/s:deg/s2"
-    return f"{name}, {who.port}: {homed}{moving}, {position}{ends}, speed {speed}{stop}{warnings}"
+    return f"{name}, {identity.port}: {homed}{moving}, {position}{ends}, speed {speed}{stop}{warnings}"
 
 
 def describe_source(rig: Rig) -> str:
     """The light source in a line; light that nobody switched on is an error."""
     source = rig.open_source()
     state = "light on" if source.is_on() else "light off"
-    who = source.describe()
-    name = ", ".join(f"{key.replace('_', ' ')} {who[key]}" for key in who if key != "model")
+    facts = source.describe()
+    name = ", ".join(f"{key.replace('_', ' ')} {facts[key]}" for key in facts if key != "model")
     if source.is_on() and not isinstance(source.inner, ManualSource):
-        raise AcquisitionError(f"{who['model']}, {name}: LIGHT LEFT ON. Every run ends with the light off: shut it")
+        raise AcquisitionError(f"{facts['model']}, {name}: LIGHT LEFT ON. Every run ends with the light off: shut it")
     if source.interlock_open():
-        raise AcquisitionError(f"{who['model']}, {name}: {state}, INTERLOCK OPEN. Close the door")
-    return f"{who['model']}, {name}: {state}, interlock closed"
+        raise AcquisitionError(f"{facts['model']}, {name}: {state}, INTERLOCK OPEN. Close the door")
+    return f"{facts['model']}, {name}: {state}, interlock closed"
 
 
 def _camera(camera: Camera, config: RigConfig, frames: int) -> str:
@@ -146,7 +146,7 @@ def _camera(camera: Camera, config: RigConfig, frames: int) -> str:
     exposure_s = max(EXPOSURE_S, config.exposure_s[0])
     # By software, whatever triggers a capture: nobody fires a hardware trigger for this.
     camera.configure(CameraSettings(exposure_s=exposure_s, frame_average=1, trigger="software"))
-    who = camera.describe()
+    identity = camera.describe()
     lost = 0
     for _ in range(frames):
         try:
@@ -157,15 +157,15 @@ def _camera(camera: Camera, config: RigConfig, frames: int) -> str:
     temperature = camera.temperature_c()
     warm = "" if temperature is None else f", {temperature:.1f} C"
     report = (
-        f"{who.library}: {who.vendor} {who.model}, serial {who.serial_number}, "
-        f"{who.sensor_width} x {who.sensor_height} {who.pixel_format} ({who.bits} bits), "
-        f"{_packets(who)}{warm}; "
+        f"{identity.library}: {identity.vendor} {identity.model}, serial {identity.serial_number}, "
+        f"{identity.sensor_width} x {identity.sensor_height} {identity.pixel_format} ({identity.bits} bits), "
+        f"{_packets(identity)}{warm}; "
         f"{lost} of {frames} frames lost, {statistics.missing_packets} packets missing, "
         f"{statistics.resent_packets} resent; counts in steps of {camera.top_of_counts.step} up to {camera.full_scale}"
         + "".join(f"; NOT IN A KNOWN STATE: {text}" for text in camera.warnings())
     )
     if lost:
-        raise AcquisitionError(report + ". " + _loss_advice(who))
+        raise AcquisitionError(report + ". " + _loss_advice(identity))
     if config.detector.bits is not None and camera.bits != config.detector.bits:
         raise AcquisitionError(
             f"{report}. The rig file says {config.detector.bits} bits under `detector`; correct that or `camera`"

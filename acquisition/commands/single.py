@@ -142,16 +142,16 @@ def own_rig_of(capture: Capture, exactly: bool) -> RigConfig:
         There is none. The rig in the capture is not used: its commands and paths may be somebody else's.
     """
     stored, mode = stored_rig(capture), capture.header.mode
-    alike = []
+    equal = []
     for file in (*own_rigs(stored.name), DEFAULT_RIG):
         with contextlib.suppress(ProcessError):
             rig = with_seed(load_rig(file), stored.simulator.seed if stored.simulator else None)
             if mode in rig.modes and rig_content(rig, mode) == rig_content(stored, mode):
                 return rig
             if file != DEFAULT_RIG:
-                alike.append(rig)
-    if alike and not exactly:
-        return alike[0]
+                equal.append(rig)
+    if equal and not exactly:
+        return equal[0]
     path = one_line(capture.path)
     raise ConfigError(
         f"{path} was begun with rig {one_line(stored.name)!r}, and you have not used such a rig file before. Devices, "
@@ -280,8 +280,8 @@ def _draw_quicklook(path: Path) -> Path:
 def _steps(ledger: dict[str, float]) -> list[str]:
     """Seconds of each kind of step that took 0.1 or more, the longest first."""
     sums = ("total_s", "unavoidable_s", "of_it_readout_s")
-    spent = {name.removesuffix("_s"): ledger[name] for name in ledger if name.endswith("_s") and name not in sums}
-    return [f"{name} {spent[name]:.1f}" for name in sorted(spent, key=lambda n: -spent[n]) if spent[name] >= 0.05]
+    times = {name.removesuffix("_s"): ledger[name] for name in ledger if name.endswith("_s") and name not in sums}
+    return [f"{name} {times[name]:.1f}" for name in sorted(times, key=lambda n: -times[n]) if times[name] >= 0.05]
 
 
 def _overhead(ledger: dict[str, float]) -> list[str]:

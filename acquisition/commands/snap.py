@@ -73,13 +73,13 @@ def _write(out: Path, pixels: NDArray[np.uint16], black: float) -> None:
     if out.suffix.lower() == ".npy":
         np.save(out, pixels)
         return
-    shown: NDArray[np.uint16] | NDArray[np.uint8] = pixels
+    image: NDArray[np.uint16] | NDArray[np.uint8] = pixels
     if out.suffix.lower() == PICTURE:
         top = max(float(np.percentile(pixels, 99.8)), black + 1)
-        shown = np.clip((pixels.astype(np.float32) - black) / (top - black) * 255, 0, 255).astype(np.uint8)
+        image = np.clip((pixels.astype(np.float32) - black) / (top - black) * 255, 0, 255).astype(np.uint8)
     from PIL import Image
 
     try:
-        Image.fromarray(shown).save(out)
+        Image.fromarray(image).save(out)
     except OSError as error:
         raise AcquisitionError(f"{out} cannot be written ({error.strerror or error}).") from error

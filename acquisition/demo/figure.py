@@ -40,10 +40,10 @@ def demo_figure(demo: Demo) -> Figure:
         f"{SIMULATED}   undeclared: {kinds}   (./lab demo --seed {demo.seed})", color="darkred", fontsize=11
     )
     parts: Any = figure.subfigures(2, 1, height_ratios=[1.5, 1], hspace=0.02)
-    below: Any = parts[1].subfigures(1, 2, width_ratios=[1, 1.3])
+    lower: Any = parts[1].subfigures(1, 2, width_ratios=[1, 1.3])
     _maps(parts[0], demo)
-    _states(below[0], demo)
-    _causes(below[1], demo)
+    _states(lower[0], demo)
+    _causes(lower[1], demo)
     return figure
 
 
@@ -52,11 +52,11 @@ def _maps(part: SubFigure, demo: Demo) -> None:
     mosaics = [_mosaic(e.mueller) for e in (demo.before, demo.after)]
     end = float(np.nanpercentile(np.abs(mosaics[0]), END_PERCENT))
     axes = part.subplots(1, 2)
-    shown: Any = None
+    image: Any = None
     for axis, mosaic, error, stage, colour in zip(
         axes, mosaics, (demo.before, demo.after), ("before", "after"), (BEFORE, AFTER), strict=True
     ):
-        shown = axis.imshow(mosaic, cmap=SIGNED, vmin=-end, vmax=end, interpolation="nearest")
+        image = axis.imshow(mosaic, cmap=SIGNED, vmin=-end, vmax=end, interpolation="nearest")
         axis.set_title(
             f"Mueller matrix {stage} the correction: rms error {error.mueller_rms:.4f}", fontsize=10, color=colour
         )
@@ -67,7 +67,7 @@ def _maps(part: SubFigure, demo: Demo) -> None:
         axis.set_yticks([])
         axis.spines[:].set_visible(False)
     part.colorbar(
-        shown, ax=axes, shrink=0.9, aspect=28, extend="both", label=f"error of M/m00, means of {BLOCK} x {BLOCK} pixels"
+        image, ax=axes, shrink=0.9, aspect=28, extend="both", label=f"error of M/m00, means of {BLOCK} x {BLOCK} pixels"
     )
 
 

@@ -120,12 +120,12 @@ def run_demo(
     say(f"./lab diagnose {sphere} {air} --instrument {declared} --write {corrected} --report {report}")
     model = InstrumentModel.load(declared)
     with progress() as step:
-        judged, problem = diagnose_captures([sphere, air], model, step)
-    write_report(report, judged, problem)
-    write_instrument(corrected, model, judged.diagnosis)
+        judgement, problem = diagnose_captures([sphere, air], model, step)
+    write_report(report, judgement, problem)
+    write_instrument(corrected, model, judgement.diagnosis)
     after = reduce(corrected)
     write_new_text(true_rig, truth)
-    return Demo(seed, faults, judged, before, after, folder, time.monotonic() - begin)
+    return Demo(seed, faults, judgement, before, after, folder, time.monotonic() - begin)
 
 
 def _with_faults(rig: RigConfig, faults: Sequence[DrawnFault], seed: int) -> RigConfig:

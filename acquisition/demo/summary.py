@@ -22,11 +22,11 @@ def cause_rows(demo: Demo) -> list[tuple[str, str]]:
 def effect_line(effect: FoundEffect) -> str:
     """Kind, values with their errors, and how sure the name is."""
     values, units = zip(*((p.told, p.unit) for p in effect.parameters.values()), strict=True)
-    shown = ", ".join(values[:MOST_VALUES]) + (", ..." if len(values) > MOST_VALUES else "")
-    shown += "" if units[0] == "1" else f" {units[0]}"
+    text = ", ".join(values[:MOST_VALUES]) + (", ..." if len(values) > MOST_VALUES else "")
+    text += "" if units[0] == "1" else f" {units[0]}"
     equal = len({name.partition("[")[0] for name in effect.indistinguishable_from} - {effect.kind})
     sure = effect.answer if effect.confident and effect.answer else "uncertain"
-    return f"{effect.kind}: {shown} ({f'one of {equal + 1} equal names' if equal else sure})"
+    return f"{effect.kind}: {text} ({f'one of {equal + 1} equal names' if equal else sure})"
 
 
 def figure_rows(demo: Demo) -> list[tuple[str, str, str, str]]:

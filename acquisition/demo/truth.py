@@ -54,14 +54,14 @@ def draw_faults(seed: int, count: int, only: Sequence[str], states: int) -> tupl
         if kind not in kinds:
             raise ConfigError(f"--only {kind}: there is no such fault, only {', '.join(kinds)}.")
     random = np.random.default_rng(seed)
-    chosen: list[str] = []
-    while len(chosen) < count:
-        excluded = set(chosen) | (EXCLUSIVE if EXCLUSIVE & set(chosen) else set())
-        free = [k for k in kinds if k not in excluded and (k in only if only else not FAULTS[k].slow)]
-        if not free:
-            raise ConfigError(f"--faults {count}: only {len(chosen)} different faults can act together.")
-        chosen.append(str(random.choice(free)))
-    return tuple(DrawnFault(kind, *FAULTS[kind].draw(random, states)) for kind in chosen)
+    drawn: list[str] = []
+    while len(drawn) < count:
+        excluded = set(drawn) | (EXCLUSIVE if EXCLUSIVE & set(drawn) else set())
+        candidates = [k for k in kinds if k not in excluded and (k in only if only else not FAULTS[k].slow)]
+        if not candidates:
+            raise ConfigError(f"--faults {count}: only {len(drawn)} different faults can act together.")
+        drawn.append(str(random.choice(candidates)))
+    return tuple(DrawnFault(kind, *FAULTS[kind].draw(random, states)) for kind in drawn)
 
 
 @dataclass(frozen=True)
@@ -106,10 +106,10 @@ def true_error(mueller: Path, xi0: Path, scene: Scene) -> TrueError:
         m, t = (_blocks(x).mean(axis=-1) for x in (image.values.astype(float), true_m))
         error = m / m[0, 0] - t / t[0, 0]
         noise = np.sqrt((_blocks(image.errors.astype(float)) ** 2).mean(axis=-1)) / BLOCK / m[0, 0]
-    off = _blocks(estimate - truth.xi0)
+    deviation = _blocks(estimate - truth.xi0)
     return TrueError(
         np.where(inside, error, np.nan),
-        np.where(inside, off.mean(axis=-1), np.nan),
+        np.where(inside, deviation.mean(axis=-1), np.nan),
         _rms(np.where(inside, noise, np.nan).reshape(16, -1)[1:]),
         _rms(np.where(inside, np.sqrt((_blocks(sigma) ** 2).mean(axis=-1)) / BLOCK, np.nan)),
     )

@@ -73,11 +73,11 @@ def describe(clash: Clash, margin_mm: float) -> str:
     """The clash in words."""
     first, second = clash.first, clash.second
     if first.turns_with and second.turns_with:
-        at = f"{first.turns_with} minus {second.turns_with} = {clash.angle_deg:.2f} deg"
+        angle = f"{first.turns_with} minus {second.turns_with} = {clash.angle_deg:.2f} deg"
     else:
         sign = 1 if first.turns_with else -1
-        at = f"{first.turns_with or second.turns_with} at {sign * clash.angle_deg:.2f} deg"
-    return f"solids {first.name!r} and {second.name!r} nearer than {margin_mm:g} mm, {at}"
+        angle = f"{first.turns_with or second.turns_with} at {sign * clash.angle_deg:.2f} deg"
+    return f"solids {first.name!r} and {second.name!r} nearer than {margin_mm:g} mm, {angle}"
 
 
 def _pairs(solids: Solids) -> Iterator[tuple[Solid, Solid]]:
@@ -140,8 +140,8 @@ def _overlap(p: NDArray[np.float64], q: NDArray[np.float64]) -> bool:
     for polygon in polygons:
         normals = (np.roll(polygon, -1, axis=0) - polygon) @ np.array([[0.0, 1.0], [-1.0, 0.0]])
         along_p, along_q = normals @ p.T, normals @ q.T
-        apart = (along_p.max(axis=1) < along_q.min(axis=1)) | (along_q.max(axis=1) < along_p.min(axis=1))
-        if apart.any():
+        is_separated = (along_p.max(axis=1) < along_q.min(axis=1)) | (along_q.max(axis=1) < along_p.min(axis=1))
+        if is_separated.any():
             return False
     return bool(polygons)
 

@@ -32,7 +32,7 @@ class RigConfig(RigSections):
     @classmethod
     def _report_all_mistakes(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         # What one section says about another is looked at even where a section cannot be read at all.
-        wrong: list[Mistake] = []
+        mistakes: list[Mistake] = []
         rig: RigConfig
         try:
             rig = valid = handler(data)
@@ -40,10 +40,10 @@ class RigConfig(RigSections):
             if not isinstance(data, dict):
                 raise
             rig, valid = _readable(data), None
-            wrong = [(entry["loc"], words_of(entry, names_in(cls))) for entry in mistakes_of(error)]
-        wrong += find_mistakes(rig)
-        if valid is None or wrong:
-            raise ValidationError.from_exception_data(cls.__name__, [_details(where, why) for where, why in wrong])
+            mistakes = [(entry["loc"], words_of(entry, names_in(cls))) for entry in mistakes_of(error)]
+        mistakes += find_mistakes(rig)
+        if valid is None or mistakes:
+            raise ValidationError.from_exception_data(cls.__name__, [_details(where, why) for where, why in mistakes])
         return valid
 
     def named_states(self) -> dict[str, Mapping[str, float]]:

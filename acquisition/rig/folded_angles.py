@@ -27,12 +27,12 @@ def _fold_column(column: np.ndarray, limits: Limits, period_deg: float) -> np.nd
     high = math.inf if limits.max_deg is None else limits.max_deg
     if np.all((low <= column) & (column <= high)):
         return column
-    out = np.empty_like(column)
+    targets = np.empty_like(column)
     last_deg = (low + high) / 2 if math.isfinite(low + high) else float(column[0])
     for k, angle in enumerate(column):
         nearest = angle + period_deg * round((last_deg - angle) / period_deg)
         inside = [a for a in (nearest, nearest - period_deg, nearest + period_deg) if low <= a <= high]
         if not inside:
             return column
-        out[k] = last_deg = min(inside, key=lambda a: abs(a - last_deg))
-    return out
+        targets[k] = last_deg = min(inside, key=lambda a: abs(a - last_deg))
+    return targets

@@ -81,12 +81,12 @@ def _leaves(
     outside = dict(start_deg)
     moving = [axis for axis in box.ranges_deg if abs(end_deg[axis] - start_deg[axis]) > EDGE_DEG]
     for axis in moving:
-        start, up = start_deg[axis], end_deg[axis] > start_deg[axis]
+        start, is_upwards = start_deg[axis], end_deg[axis] > start_deg[axis]
         low, high = _nearest_copy(box.ranges_deg[axis], start)
-        way, other_way = (high - start, start - low) if up else (start - low, high - start)
-        shortest = way <= other_way + EDGE_DEG or not _can_reach(limits.get(axis), low if up else high)
+        way, other_way = (high - start, start - low) if is_upwards else (start - low, high - start)
+        shortest = way <= other_way + EDGE_DEG or not _can_reach(limits.get(axis), low if is_upwards else high)
         if way <= EDGE_DEG or (moving == [axis] and shortest):
-            outside[axis] = math.nextafter(high, math.inf) if up else math.nextafter(low, -math.inf)
+            outside[axis] = math.nextafter(high, math.inf) if is_upwards else math.nextafter(low, -math.inf)
     return outside != start_deg and not touches(box, swept_ranges(outside, end_deg))
 
 

@@ -91,11 +91,11 @@ class Guard:
         self.journal.note("guard watches", pid=self.pid, rig=self.config.name)
         self._say(line, watching=True)
         while True:
-            heard = select.select([line], [], [], LOOK_S)[0]
+            readable = select.select([line], [], [], LOOK_S)[0]
             now_s = time.monotonic()
-            silent_s = 0.0 if heard else silent_s + min(now_s - before_s, LATE_S)
+            silent_s = 0.0 if readable else silent_s + min(now_s - before_s, LATE_S)
             before_s = now_s
-            if heard:
+            if readable:
                 data = _receive(line)
                 if not data:
                     return self._act("acquire died", beat)
@@ -123,12 +123,12 @@ class Guard:
 
     def _is_lost(self, line: socket.socket, silent_s: float) -> bool:
         """Shut the light of an `acquire` that is silent; True once it has been killed for that."""
-        stopped = is_stopped(self.pid)
-        if silent_s > (STOPPED_KILL_S if stopped else SILENT_KILL_S):
+        is_frozen = is_stopped(self.pid)
+        if silent_s > (STOPPED_KILL_S if is_frozen else SILENT_KILL_S):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
             return True
-        if not self._has_shut and silent_s > (STOPPED_SHUT_S if stopped else SILENT_SHUT_S):
+        if not self._has_shut and silent_s > (STOPPED_SHUT_S if is_frozen else SILENT_SHUT_S):
             # It may come back: only the light does not wait for that.
             self._has_shut = self._try_light() is None
             if self._has_shut:
@@ -358,8 +358,8 @@ def main() -> None:
     journal = Journal(Path(hello["log"]) if hello["log"] else None)
     if hello["before"]:
         journal.note("guard restarted", before=hello["before"])
-    held = dict(zip(hello["ports"], descriptors, strict=False))
-    guard = Guard(with_held_ports(config, held), hello["pid"], journal, config)
+    port_descriptors = dict(zip(hello["ports"], descriptors, strict=False))
+    guard = Guard(with_held_ports(config, port_descriptors), hello["pid"], journal, config)
     guard.open_cutoff()
     in_order = guard.watch(line)
     # The next program may want the ports while a slow disc still takes the last words.

@@ -122,25 +122,25 @@ class Guarding:
     # --- the heart ---------------------------------------------------------------------------------------
 
     def _live(self) -> None:
-        lost, before = 0, ""
+        losses, before = 0, ""
         while not self._ended.is_set():
             begin_s = time.monotonic()
             try:
-                why = self._start(before) or self._beat()
+                reason = self._start(before) or self._beat()
             except Exception as error:  # noqa: BLE001 - no guard: whatever it was, the light is shut
-                why = f"{type(error).__name__}: {error}"
-            if self._ended.is_set() and why == "":
+                reason = f"{type(error).__name__}: {error}"
+            if self._ended.is_set() and reason == "":
                 return
             self._watching.clear()
             # What is lost must not act in the middle of the next one's watch.
             if self._guard is not None:
                 self._guard.kill()
-            self._dark(f"the guard was lost ({why}): the light was shut, another guard is started")
+            self._dark(f"the guard was lost ({reason}): the light was shut, another guard is started")
             self._drop()
-            before = why
-            lost = 1 if time.monotonic() - begin_s > WELL_S else lost + 1
-            if lost > MOST_LOST:
-                self._hopeless = f"{lost} guards in a row were lost, the last: {why}"
+            before = reason
+            losses = 1 if time.monotonic() - begin_s > WELL_S else losses + 1
+            if losses > MOST_LOST:
+                self._hopeless = f"{losses} guards in a row were lost, the last: {reason}"
                 return
 
     def _start(self, before: str) -> str:

@@ -36,12 +36,12 @@ def light_so_far(capture: Capture) -> LightSoFar:
     """The light that a partial capture has measured, as its interlocks saw it."""
     exposure_s, monitor = capture.column("exposure_s"), capture.column("monitor")
     shortest_s = 1.001 * np.nanmin(capture.planned_column("exposure_s"), initial=np.inf)
-    judged = [k for k, role in enumerate(capture.role) if role != "dark" and exposure_s[k] <= shortest_s]
-    at: dict[Pose, float] = {}
-    for k in judged:
+    states = [k for k, role in enumerate(capture.role) if role != "dark" and exposure_s[k] <= shortest_s]
+    monitor_at: dict[Pose, float] = {}
+    for k in states:
         pose = _pose(exposure_s[k], {axis: angles[k] for axis, angles in capture.angles_deg.items()})
-        at.setdefault(pose, float(monitor[k]))
-    return LightSoFar(float(monitor[judged[0]]) if judged else None, at)
+        monitor_at.setdefault(pose, float(monitor[k]))
+    return LightSoFar(float(monitor[states[0]]) if states else None, monitor_at)
 
 
 class Interlocks:

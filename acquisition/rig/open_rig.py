@@ -119,10 +119,10 @@ class EmulatedRig(Rig):
         instrument: InstrumentModel | None = None,
         omega_deg: float | None = None,
     ) -> None:
-        chosen = mode or next(iter(self.config.modes))
-        truth = self._simulator.truth.get(chosen)
+        name = mode or next(iter(self.config.modes))
+        truth = self._simulator.truth.get(name)
         if truth is not None or instrument is None:
-            instrument = InstrumentModel.load(truth or self.config.modes[chosen].instrument)
+            instrument = InstrumentModel.load(truth or self.config.modes[name].instrument)
         self.simulation.prepare(sample, instrument, wavelength_nm or self.config.wavelengths_nm[0], omega_deg)
 
     def observers(self) -> Sequence[Observer]:

@@ -254,8 +254,8 @@ class Rig(JointAxes):
             disobeyed = self.source.disobeyed
         # The next try opens the axes anew.
         restless = None if will_retry else self._stop_failed or self._unconfirmed_stop()
-        failed = [text for text in (disobeyed, restless) if text is not None]
-        text = f"acquire could not make the rig safe: {'; '.join(failed)}" if failed else None
+        problems = [text for text in (disobeyed, restless) if text is not None]
+        text = f"acquire could not make the rig safe: {'; '.join(problems)}" if problems else None
         if not guarding.end(text):
             self.insist_on_dark()
         elif text is not None:

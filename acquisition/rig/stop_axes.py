@@ -44,17 +44,17 @@ def stop_axes(config: RigConfig, tell: Tell, let_go: Collection[int] = ()) -> bo
         lines.setdefault(os.path.realpath(entry.port), {})[name] = entry
     pids = set(let_go) or _tell_running(list(lines), tell)
     with LineRegistry(clock=clock_of(config)) as registry, ThreadPoolExecutor(max(1, len(lines))) as threads:
-        stopped = threads.map(lambda port: _stop_line(port, lines[port], registry, pids, tell=tell), lines)
-        return all(list(stopped))
+        results = threads.map(lambda port: _stop_line(port, lines[port], registry, pids, tell=tell), lines)
+        return all(list(results))
 
 
 def _tell_running(ports: list[str], tell: Tell) -> set[int]:
     """Signal every running `acquire` that holds one of the ports; returns their process ids."""
-    holders = {pid: who for port in ports for pid, who in port_holders(port) if pid != os.getpid()}
+    holders = {pid: program for port in ports for pid, program in port_holders(port) if pid != os.getpid()}
     pids = set()
-    for pid, who in holders.items():
+    for pid, program in holders.items():
         if not _is_acquire(pid):
-            tell(f"{who} holds a port of this rig; it is not acquire and gets no signal")
+            tell(f"{program} holds a port of this rig; it is not acquire and gets no signal")
             continue
         try:
             # Two different signals: a second one of the same kind could merge with the first.
@@ -63,9 +63,9 @@ def _tell_running(ports: list[str], tell: Tell) -> set[int]:
         except ProcessLookupError:
             continue
         except PermissionError:
-            tell(f"{who} measures on this rig under another user: stop it there, with Ctrl-C twice")
+            tell(f"{program} measures on this rig under another user: stop it there, with Ctrl-C twice")
             continue
-        tell(f"{who} measures on this rig: asked to stop at once, as by Ctrl-C twice")
+        tell(f"{program} measures on this rig: asked to stop at once, as by Ctrl-C twice")
         pids.add(pid)
     return pids
 
@@ -132,8 +132,8 @@ def _stop_when_free(name: str, entry: AxisConfig, lines: LineRegistry) -> Motion
 
 
 def _tell_failed(name: str, error: DeviceError, tell: Tell) -> None:
-    why = "NOT STOPPED" if isinstance(error, PortBusy) else "not known whether it stopped"
-    tell(f"{name}: {why}. {error}. If it moves, switch its power off")
+    outcome = "NOT STOPPED" if isinstance(error, PortBusy) else "not known whether it stopped"
+    tell(f"{name}: {outcome}. {error}. If it moves, switch its power off")
 
 
 def _wait_let_go(port: str, pids: set[int]) -> None:

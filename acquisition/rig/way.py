@@ -116,8 +116,8 @@ def find_way(
         poses.insert(0, nodes[node])
         node = came_from[node]
     detour = zip([start, *poses], poses[:-1], strict=False)
-    turned = [{name: pose[name] for name in axes if pose[name] != before[name]} for before, pose in detour]
-    return [*turned, dict(target_deg)]
+    moves = [{name: pose[name] for name in axes if pose[name] != before[name]} for before, pose in detour]
+    return [*moves, dict(target_deg)]
 
 
 def restricted_axes(rig: RigSections) -> set[str]:

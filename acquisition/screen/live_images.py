@@ -73,8 +73,8 @@ def _map_png(values: NDArray[np.floating], light: NDArray[np.floating]) -> bytes
 
     # Where there is hardly any light, noise alone would look like full polarization.
     lit = light > 0.02 * float(np.percentile(light, 99.5))
-    shown = np.where(lit, np.clip(values, 0, 1), 0)
-    return png(colormaps["viridis"]((shown * 255).astype(np.uint8), bytes=True)[..., :3])
+    scaled = np.where(lit, np.clip(values, 0, 1), 0)
+    return png(colormaps["viridis"]((scaled * 255).astype(np.uint8), bytes=True)[..., :3])
 
 
 def histogram(pixels: NDArray[np.uint16], full_scale: int) -> list[int]:

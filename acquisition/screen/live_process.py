@@ -93,11 +93,11 @@ class Shown:
 
     def _draw_once(self, name: str, draw: Callable[[], Drawn]) -> Drawn:
         # Under the lock of its own pictures: a second browser waits for the first one's instead of drawing again.
-        drawn = self._drawn
+        pictures = self._drawn
         with self._drawing:
-            if name not in drawn:
-                drawn[name] = draw()
-            picture: Drawn = drawn[name]
+            if name not in pictures:
+                pictures[name] = draw()
+            picture: Drawn = pictures[name]
             return picture
 
     _drawing: ClassVar[threading.Lock] = threading.Lock()

@@ -58,10 +58,10 @@ class LiveView(Observer):
 
     def __enter__(self) -> Self:
         self._link, child_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        passed = [self._listener.fileno(), child_end.fileno(), self._memory]
+        descriptors = [self._listener.fileno(), child_end.fileno(), self._memory]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "acquisition.screen.live_process", *map(str, passed)],
-            pass_fds=passed,
+            [sys.executable, "-m", "acquisition.screen.live_process", *map(str, descriptors)],
+            pass_fds=descriptors,
             cwd=Path(__file__).parents[2],
             stdin=subprocess.DEVNULL,
             # Ctrl-C in the terminal is for the measuring program.

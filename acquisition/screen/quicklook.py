@@ -38,11 +38,11 @@ def draw(path: Path) -> Path:
         (left, mean, "mean, counts above dark", (0.0, None)),
         (middle, modulation, "modulation", (0.0, upper_end(modulation))),
     ):
-        shown = axes.imshow(image, cmap="gray" if axes is left else "viridis", vmin=limits[0], vmax=limits[1])
+        mappable = axes.imshow(image, cmap="gray" if axes is left else "viridis", vmin=limits[0], vmax=limits[1])
         axes.set_title(title)
         axes.set_xticks([])
         axes.set_yticks([])
-        figure.colorbar(shown, ax=axes, shrink=0.8, extend=clipped(image, *shown.get_clim()))
+        figure.colorbar(mappable, ax=axes, shrink=0.8, extend=clipped(image, *mappable.get_clim()))
     right.plot(states, levels, "o-", markersize=3, linewidth=0.8)
     right.set_xlabel("state")
     right.set_ylabel("frame mean, counts above dark")

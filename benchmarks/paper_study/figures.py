@@ -99,8 +99,8 @@ def orientation(images: Mapping[float, Dominant]) -> Shown:
         for part in ("measured", "modelled"):
             panels.append((rf"$\psi$ {part}, {nm:g} nm / degrees", _psi(getattr(image, part)), CYCLIC))
         a, b = (linear_diattenuation(m) for m in (image.modelled, image.measured))
-        off = np.abs(np.rad2deg(orientation_difference(a, b)))
-        panels.append((rf"deviation, {nm:g} nm / degrees", off, {"cmap": "magma", "vmin": 0, "vmax": 45}))
+        delta = np.abs(np.rad2deg(orientation_difference(a, b)))
+        panels.append((rf"deviation, {nm:g} nm / degrees", delta, {"cmap": "magma", "vmin": 0, "vmax": 45}))
     caption = "Orientation psi of the diattenuation of the dominant process (paper, Fig. 7), with its noise."
     return Shown(_grid(panels, 3), caption)
 
@@ -182,8 +182,8 @@ def polarizer_pairs(body: Mapping[float, BodyProducts]) -> Shown:
                 low, high = (float(np.percentile(values, p)) for p in (1, 99)) if values.size else (0.0, 1.0)
                 label = f"{name.replace('_', ' ')}, {nm:g} nm: correlation {_correlation(*pair):.2f}"
                 cut = _object_only(pair)
-                beside = np.concatenate([pair[0][cut], _gap(pair[0][cut], axis=1), pair[1][cut]], axis=1)
-                panels.append((label, beside, {"cmap": "gray", "vmin": low, "vmax": high}))
+                tile = np.concatenate([pair[0][cut], _gap(pair[0][cut], axis=1), pair[1][cut]], axis=1)
+                panels.append((label, tile, {"cmap": "gray", "vmin": low, "vmax": high}))
     caption = (
         "The body between two polarizers, light over m00 (paper, Fig. 12): on the left measured by the Mueller "
         "polarimeter, on the right extrapolated from one linear Stokes image. Each pair has one scale."
@@ -196,8 +196,8 @@ def fault_images(before: Dominant, after: Dominant, nm: float) -> Shown:
     panels: Panels = []
     for name, image in (("before", before), ("after", after)):
         a, b = (linear_diattenuation(m) for m in (image.modelled, image.measured))
-        off = np.rad2deg(orientation_difference(b, a))
-        panels.append((rf"$\psi$ measured - model, {name} / degrees", off, {"cmap": "RdBu_r", "vmin": -10, "vmax": 10}))
+        psi = np.rad2deg(orientation_difference(b, a))
+        panels.append((rf"$\psi$ measured - model, {name} / degrees", psi, {"cmap": "RdBu_r", "vmin": -10, "vmax": 10}))
     return Shown(_grid(panels, 2), f"Deviation of psi with the undeclared fault, and after `diagnose`, {nm:g} nm.")
 
 

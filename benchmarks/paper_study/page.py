@@ -37,8 +37,8 @@ def write_page(
 ) -> None:
     """Write the HTML file."""
     wavelengths = sorted({row.wavelength_nm for row in sphere.as_told.rows})
-    shown = {nm: _shown_product(sphere.folder, nm) for nm in wavelengths}
-    dominant = {nm: figures.dominant(path, SPHERE, TABLE_I) for nm, path in shown.items()}
+    paths = {nm: _shown_product(sphere.folder, nm) for nm in wavelengths}
+    dominant = {nm: figures.dominant(path, SPHERE, TABLE_I) for nm, path in paths.items()}
     of_body = {nm: figures.dominant(products.mueller, BODY, TABLE_I) for nm, products in body.items()}
     sections = [
         _numbers(size, sphere, wavelengths, seconds),
@@ -144,9 +144,9 @@ def _materials(sphere: SphereStudy, wavelengths: Sequence[float]) -> ReportSecti
     declared, true = load_reflectance(TABLE_I), load_reflectance(TRUE_MATERIAL)
     rows = [["", "n", "k", "a", "b", "reduced chi-square", "pixels"]]
     for nm in wavelengths:
-        for who, material in (("paper, Table I", declared), ("the bench, not told", true)):
+        for source, material in (("paper, Table I", declared), ("the bench, not told", true)):
             c = material.constants[nm]
-            rows.append([f"{nm:g} nm, {who}", f"{c.n:g}", f"{c.k:g}", f"{c.a:g}", f"{c.b:g}", "", ""])
+            rows.append([f"{nm:g} nm, {source}", f"{c.n:g}", f"{c.k:g}", f"{c.a:g}", f"{c.b:g}", "", ""])
         for images, fitted in sphere.fits[nm].items():
             fit = fitted.fit
             cells = [

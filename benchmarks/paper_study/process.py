@@ -123,17 +123,17 @@ def study_fault(captures: Path, out: Path, healthy: SphereStudy, pool: Executor,
 
 def _diagnosed(captures: Path, out: Path) -> tuple[Diagnosis, Path]:
     out.mkdir(parents=True, exist_ok=True)
-    chosen = []
+    sources = []
     for path in sorted(captures.glob("*.h5")):
         with Capture(path) as capture:
             if capture.header.sample.kind == "air" or capture.header.omega_deg == SHOWN_DEG:
-                chosen.append(path)
+                sources.append(path)
     model = InstrumentModel.load(RGB950)
-    judged, _ = diagnose_captures(chosen, model)
+    judgement, _ = diagnose_captures(sources, model)
     target = out / "rgb950_diagnosed.yaml"
     target.unlink(missing_ok=True)
-    write_instrument(target, model, judged.diagnosis)
-    return judged.diagnosis, target
+    write_instrument(target, model, judgement.diagnosis)
+    return judgement.diagnosis, target
 
 
 def _xi0(faulty: CampaignResult, healthy: SphereStudy) -> dict[tuple[float, float], float]:
@@ -147,8 +147,8 @@ def _xi0(faulty: CampaignResult, healthy: SphereStudy) -> dict[tuple[float, floa
             for path in (faulty.tables["mueller", row.wavelength_nm], stokes["stokes", row.wavelength_nm])
         ]
         view = healthy.as_told.views["stokes"]
-        compared = compare_on_sphere(tables[0], tables[1], view, row.omega_deg, shape=shape)
-        rmsd[row.wavelength_nm, row.omega_deg] = compared.get("xi0_percent", float("nan"))
+        comparison = compare_on_sphere(tables[0], tables[1], view, row.omega_deg, shape=shape)
+        rmsd[row.wavelength_nm, row.omega_deg] = comparison.get("xi0_percent", float("nan"))
     return rmsd
 
 
@@ -162,9 +162,9 @@ def _fits(captures: Path, products: Path, geometries: Mapping[str, Path]) -> dic
     for path, kind, nm, omega, *_ in find_captures(captures)[0]:
         by_kind.setdefault((nm, kind), []).append((omega, products / f"{path.stem}.{kind}.h5"))
     fits: dict[float, dict[str, FittedMaterial]] = {}
-    for (nm, kind), several in by_kind.items():
-        step = max(1, -(-len(several) // FITTED_ANGLES))
-        sources = tuple(path for _, path in sorted(several)[::step])
+    for (nm, kind), images in by_kind.items():
+        step = max(1, -(-len(images) // FITTED_ANGLES))
+        sources = tuple(path for _, path in sorted(images)[::step])
         # Of Mueller images both ways that the paper's conclusions propose; Stokes images allow the second alone.
         for correlation in (False, True) if kind == "mueller" else (False,):
             fitting = MaterialFitting(sources, geometries[kind], "fitted red print", correlation)

@@ -224,10 +224,10 @@ class ElliptecAxis(SessionReferenceAxis):
 
     def _take_end(self) -> bool:
         """Take note of the module's message at the end of its move, if it has come."""
-        ended = self._line.ended.pop(self._address, None) if self._in_motion else None
-        if ended is None:
+        end = self._line.ended.pop(self._address, None) if self._in_motion else None
+        if end is None:
             return False
-        letters, data = ended
+        letters, data = end
         if letters == "PO":
             self._saw_motion = True
         else:

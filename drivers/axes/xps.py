@@ -285,11 +285,11 @@ class XPSAxis(MotionAxis):
 def open(name: str, config: Config, lines: LineRegistry) -> XPSAxis:
     """Open one axis; reads identity, limits and speed and moves nothing."""
     make = partial(XPSLine, config, lines.clock)
-    with lines.taken(config.port, XPSLine, make) as line, contextlib.ExitStack() as failed:
+    with lines.taken(config.port, XPSLine, make) as line, contextlib.ExitStack() as cleanup:
         links: list[SerialLink] = []
         for _ in range(2):
             links.append(SerialLink(config.port, 9600, framer, clock=lines.clock))
-            failed.callback(links[-1].close)
+            cleanup.callback(links[-1].close)
         axis = XPSAxis(name, config, line, lines, moving=links[0], stopping=links[1])
-        failed.pop_all()
+        cleanup.pop_all()
         return axis

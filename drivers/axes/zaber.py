@@ -70,8 +70,8 @@ class Config(AxisConfig):
     baudrate: int = Field(default=115_200, description="bits a second, as the controller is set")
 
     def place(self) -> str:
-        who = f"serial number {self.serial_number}" if self.address is None else f"address {self.address}"
-        return f"{who} axis {self.axis}"
+        device = f"serial number {self.serial_number}" if self.address is None else f"address {self.address}"
+        return f"{device} axis {self.axis}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,8 +249,8 @@ class ZaberAxis(MotionAxis):
             if config.address in (None, address) and str(config.serial_number or serial) == serial
         ]
         if len(matches) != 1:
-            named = {"address": config.address, "serial_number": config.serial_number}
-            rule = ", ".join(f"{key} {value}" for key, value in named.items() if value is not None)
+            criteria = {"address": config.address, "serial_number": config.serial_number}
+            rule = ", ".join(f"{key} {value}" for key, value in criteria.items() if value is not None)
             mismatch = f"no device has {rule}" if rule else f"{len(matches)} devices answer and the rig file names none"
             raise WrongDevice(request, f"{mismatch}; found {listing}", "Correct the rig file or the wiring")
         return matches[0]

@@ -74,9 +74,9 @@ class TunableFilter(ShutteredSource):
             return
         self._line.tell(f"{keyword}={value:g}")
         self._link.clock.sleep_s(self.config.settle_s)
-        back = self._value(keyword)
-        if abs(back - value) > _SAME_NM:
-            raise DeviceError(f"{self._name}, {keyword}={value:g}", f"it reads back {back:g}", "Is it in manual mode?")
+        echo = self._value(keyword)
+        if abs(echo - value) > _SAME_NM:
+            raise DeviceError(f"{self._name}, {keyword}={value:g}", f"it reads back {echo:g}", "Is it in manual mode?")
 
     def _require_ready(self) -> None:
         if self._value("ST") != READY:

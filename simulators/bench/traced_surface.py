@@ -70,10 +70,10 @@ def trace_surface(material: ReflectanceModel) -> ReflectanceModel:
 def _outwards(g: ScatteringGeometry, facet: Array) -> tuple[Array, Array]:
     """Axis (2, ...) of the polarizer that diffuse light meets, away from where facet and surface agree; sin theta_h."""
     cosine = _dot(facet, g.normal)
-    away = facet * cosine[..., None] - g.normal
-    sine = np.sqrt(_dot(away, away))
+    outward = facet * cosine[..., None] - g.normal
+    sine = np.sqrt(_dot(outward, outward))
     flat = g.to_source - facet * _dot(g.to_source, facet)[..., None]
-    u = np.stack([_dot(flat, away), _dot(flat, np.cross(facet, away))])
+    u = np.stack([_dot(flat, outward), _dot(flat, np.cross(facet, outward))])
     length = np.hypot(u[0], u[1])
     # Where there is no such direction its weight is zero as well.
     return np.divide(u, length, out=np.zeros_like(u), where=length > 0), sine
@@ -91,9 +91,9 @@ def _mirrored(field: ComplexArray, to_source: Array, facet: Array, index: comple
     in_plane = direction * _dot(tangential, direction)[..., None]
     in_plane_share = (inside - index * cosine) / (inside + index * cosine)
     across_share = (cosine - index * inside) / (cosine + index * inside)
-    back = in_plane * in_plane_share + (tangential - in_plane) * across_share
+    reflected = in_plane * in_plane_share + (tangential - in_plane) * across_share
     # E is at right angles to the way of the wave: along . E + cosine E_n = 0.
-    return np.asarray(back - facet * (_dot(along, back)[..., None] / cosine))
+    return np.asarray(reflected - facet * (_dot(along, reflected)[..., None] / cosine))
 
 
 def _dot(a: Any, b: Any) -> Any:

@@ -57,11 +57,11 @@ def write_virtual_capture(
     """
     axes = instrument.axes
     psg = RGB950_STEP_DEG * np.arange(states)
-    turned = {"psg": psg, "psa": RGB950_RATIO * psg}
-    unknown = [axis for axis in axes if axis not in turned]
+    pose_of_axis = {"psg": psg, "psa": RGB950_RATIO * psg}
+    unknown = [axis for axis in axes if axis not in pose_of_axis]
     if unknown:
         raise ValueError(f"virtual captures turn psg and psa only; the instrument has {', '.join(unknown)}")
-    angles = {axis: np.concatenate([np.zeros(darks), turned[axis]]) for axis in axes}
+    angles = {axis: np.concatenate([np.zeros(darks), pose_of_axis[axis]]) for axis in axes}
     header = CaptureHeader(
         title=f"{name} {bench.wavelength_nm:g} nm omega {omega_deg:g}",
         simulated=True,

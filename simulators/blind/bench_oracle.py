@@ -50,8 +50,8 @@ def fit_of_the_truth(
 
 def read_oracle(folder: Path, truth: RealBench, configs: Path, capture_set: str) -> float:
     """Error of M / m00 of the validation sample after a fit of the true set; kept beside the truth once it is known."""
-    away = folder / "truth" / truth.name
-    cache = away / f"oracle_{capture_set}.json"
+    base = folder / "truth" / truth.name
+    cache = base / f"oracle_{capture_set}.json"
     if cache.exists():
         return float(json.loads(cache.read_text(encoding="utf-8")))
     captures = [folder / truth.name / f"{name}.h5" for name in GIVEN[capture_set]]
@@ -59,7 +59,7 @@ def read_oracle(folder: Path, truth: RealBench, configs: Path, capture_set: str)
     best = fit_of_the_truth(captures, declared, active(truth, GIVEN[capture_set]))
     error = float("nan")
     if best is not None:
-        error = error_of(away / f"{VALIDATION}.h5", best, np.load(away / f"{VALIDATION}.npy").astype(float))
+        error = error_of(base / f"{VALIDATION}.h5", best, np.load(base / f"{VALIDATION}.npy").astype(float))
     cache.write_text(json.dumps(error), encoding="utf-8")
     return error
 

@@ -29,23 +29,23 @@ def judge_bench(
     """
     declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
     captures = [folder / truth.name / f"{name}.h5" for name in GIVEN[capture_set]]
-    begun = time.perf_counter()
+    begin = time.perf_counter()
     result, corrected, corrects = _diagnosed(captures, declared)
-    seconds = time.perf_counter() - begun
-    away = folder / "truth" / truth.name
-    covered = coverage_of(away / f"{VALIDATION}_noisy.h5", corrected, _truth(away, VALIDATION))
+    seconds = time.perf_counter() - begin
+    base = folder / "truth" / truth.name
+    coverage = coverage_of(base / f"{VALIDATION}_noisy.h5", corrected, _truth(base, VALIDATION))
     judgement = BenchJudgement(
         name=truth.name,
         group=truth.group,
         given=capture_set,
         verdict=result["verdict"],
         seconds=round(seconds, 2),
-        declared=_error(away, VALIDATION, declared),
-        corrected=_error(away, VALIDATION, corrected),
+        declared=_error(base, VALIDATION, declared),
+        corrected=_error(base, VALIDATION, corrected),
         oracle=float("nan"),
-        own={name: (_error(away, name, declared), _error(away, name, corrected)) for name in GIVEN[capture_set]},
-        coverage_pixels=covered.pixels,
-        coverage_patches=covered.patches,
+        own={name: (_error(base, name, declared), _error(base, name, corrected)) for name in GIVEN[capture_set]},
+        coverage_pixels=coverage.pixels,
+        coverage_patches=coverage.patches,
         written=corrects,
         causes=names_of(result, truth, GIVEN[capture_set]),
         matters=matters_of(result, truth, GIVEN[capture_set]),
@@ -59,10 +59,10 @@ def judge_bench(
 def _diagnosed(captures: Sequence[Path], declared: InstrumentModel) -> tuple[dict[str, Any], InstrumentModel, bool]:
     """The result as JSON has it, the instrument as it is written and read again, and whether it is another one."""
     try:
-        judged, _ = diagnose_captures(captures, declared)
+        judgement, _ = diagnose_captures(captures, declared)
     except Exception as error:  # noqa: BLE001 - a crash is a wrong answer of this bench, not the end of the suite
         return {"verdict": f"crashed: {type(error).__name__}: {error}", "effects": []}, declared, False
-    diagnosis = judged.diagnosis
+    diagnosis = judgement.diagnosis
     corrected = declared
     if diagnosis.corrects or diagnosis.systematic():
         with TemporaryDirectory() as folder:

@@ -123,10 +123,10 @@ def _name_lines(judgements: Sequence[BenchJudgement]) -> list[str]:
 
 
 def _line(j: BenchJudgement) -> str:
-    wrong = ", ".join(c.label for c in sure_and_wrong(j))
+    errors = ", ".join(c.label for c in sure_and_wrong(j))
     missed = ", ".join(f"{m.label} {m.size:.1f}" for m in j.matters if m.size > MATTERS and m.told == "missed")
     return (
         f"{j.name} {j.given:6s} {j.verdict:16s} {j.seconds:6.1f} s  M {j.declared:.5f} -> {j.corrected:.5f} "
         f"(true set {j.oracle:.5f}){' WORSE' if is_worse(j.declared, j.corrected) else ''}"
-        f"{f'; sure and wrong: {wrong}' if wrong else ''}{f'; missed: {missed}' if missed else ''}"
+        f"{f'; sure and wrong: {errors}' if errors else ''}{f'; missed: {missed}' if missed else ''}"
     )

@@ -32,10 +32,10 @@ def black_jitter(bench: TrueBench, random: np.random.Generator, states: int) -> 
 
 def uneven_steps(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """The converter's steps are uneven: a pattern of 64 steps that is 4 counts off at most, the same everywhere."""
-    off = np.cumsum(random.standard_normal(64))
-    off -= np.linspace(off[0], off[-1], 64)
-    off *= 4.0 / np.abs(off).max()
-    bench.stored.append(lambda counts: counts + off[counts.astype(int) // 16 % 64])
+    offsets = np.cumsum(random.standard_normal(64))
+    offsets -= np.linspace(offsets[0], offsets[-1], 64)
+    offsets *= 4.0 / np.abs(offsets).max()
+    bench.stored.append(lambda counts: counts + offsets[counts.astype(int) // 16 % 64])
     return Truth("uneven_steps")
 
 
@@ -73,8 +73,8 @@ def bad_frame(bench: TrueBench, random: np.random.Generator, states: int) -> Tru
         level = random.uniform(0.2, 0.8)
         bench.level.append(lambda k, a: level if k == bad else 1.0)
     else:
-        off = np.deg2rad(random.uniform(8, 60))
-        bench.angles.append(lambda k, a: a | {"psg": a["psg"] + off * (k == bad)})
+        offset = np.deg2rad(random.uniform(8, 60))
+        bench.angles.append(lambda k, a: a | {"psg": a["psg"] + offset * (k == bad)})
     return Truth("bad_frame", "", {"state": float(bad)})
 
 

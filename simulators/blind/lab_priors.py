@@ -64,10 +64,10 @@ EXCLUSIVE = ({"detector_nonlinearity", "tone_curve"},)
 def draw_kinds(random: np.random.Generator) -> list[str]:
     """Kinds of fault of one bench."""
     count = int(random.integers(FAULTS[0], FAULTS[1] + 1))
-    chosen: list[str] = []
-    while len(chosen) < count:
-        excluded = set(chosen).union(*(group for group in EXCLUSIVE if group & set(chosen)))
+    drawn: list[str] = []
+    while len(drawn) < count:
+        excluded = set(drawn).union(*(group for group in EXCLUSIVE if group & set(drawn)))
         open_kinds = [k for k in PRIORS if k not in excluded]
         weights = np.array([PRIORS[k].weight for k in open_kinds])
-        chosen.append(str(random.choice(open_kinds, p=weights / weights.sum())))
-    return chosen
+        drawn.append(str(random.choice(open_kinds, p=weights / weights.sum())))
+    return drawn

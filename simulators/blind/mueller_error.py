@@ -47,10 +47,10 @@ class Reduced:
     def of(cls, path: Path, model: InstrumentModel) -> "Reduced":
         """Reduce a capture as `process reduce` does; `model` as loaded from its file."""
         with TemporaryDirectory() as folder, Capture(path) as capture:
-            out = Path(folder) / "mueller.h5"
-            reduce_mueller(capture, model.at(capture.header.wavelength_nm), out, ())
-            image = MuellerImage.load(out)
-            with Product(out) as product:
+            product_file = Path(folder) / "mueller.h5"
+            reduce_mueller(capture, model.at(capture.header.wavelength_nm), product_file, ())
+            image = MuellerImage.load(product_file)
+            with Product(product_file) as product:
                 systematic = product.get(SYSTEMATIC) if SYSTEMATIC in product.names else np.zeros_like(image.values)
         m = image.values.reshape(16, *image.mask.shape).astype(float)
         normalized = m[1:] / m[0]
@@ -68,18 +68,18 @@ class Reduced:
 
     def error(self, truth: Array) -> float:
         """Root mean square error of M / m00; truth (4, 4, rows, columns)."""
-        off = self.values - truth.reshape(16, *self.lit.shape)[1:]
-        return float(np.sqrt(np.mean(off[:, self.lit] ** 2)))
+        deviation = self.values - truth.reshape(16, *self.lit.shape)[1:]
+        return float(np.sqrt(np.mean(deviation[:, self.lit] ** 2)))
 
     def coverage(self, truth: Array) -> Coverage:
         """How often the truth is in the interval of noise and systematic error."""
-        off = self.values - truth.reshape(16, *self.lit.shape)[1:]
-        inside = np.abs(off) <= INTERVAL * np.hypot(self.noise, self.systematic)
+        deviation = self.values - truth.reshape(16, *self.lit.shape)[1:]
+        inside = np.abs(deviation) <= INTERVAL * np.hypot(self.noise, self.systematic)
         is_full = np.asarray(_patches(self.lit).all(axis=-1))
         # Noise of pixels is independent, an error of the instrument is common to them.
         noise = np.sqrt((_patches(self.noise) ** 2).sum(axis=-1)) / PATCH**2
         sigma = np.hypot(noise, _patches(self.systematic).mean(axis=-1))
-        means = np.abs(_patches(off).mean(axis=-1)) <= INTERVAL * sigma
+        means = np.abs(_patches(deviation).mean(axis=-1)) <= INTERVAL * sigma
         return Coverage(float(inside[:, self.lit].mean()), float(means[:, is_full].mean()))
 
 

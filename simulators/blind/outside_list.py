@@ -68,8 +68,8 @@ def ghost(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
 
     def add(k: int, e: Array) -> Array:
         turn = 2 * np.pi * k / states + phase
-        moved = map_coordinates(e, [y - radius * np.sin(turn), x - radius * np.cos(turn)], order=1, mode="nearest")
-        return np.asarray((1 - size) * e + size * moved)
+        image = map_coordinates(e, [y - radius * np.sin(turn), x - radius * np.cos(turn)], order=1, mode="nearest")
+        return np.asarray((1 - size) * e + size * image)
 
     bench.light.append(add)
     return Truth("ghost")

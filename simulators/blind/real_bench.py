@@ -212,8 +212,8 @@ def make_bench(
         run = _Taken(sound, draws, capture, scene, angles)
         bench, exposed, faults = run.exposed()
         sample = Sample(kind="air" if capture == "air" else "unknown")
-        quiet = counted(bench, expected_electrons(bench, exposed))
-        write_capture(truth_folder / f"{capture}.h5", bench, quiet, angles, sample=sample, instrument=text)
+        noiseless = counted(bench, expected_electrons(bench, exposed))
+        write_capture(truth_folder / f"{capture}.h5", bench, noiseless, angles, sample=sample, instrument=text)
         target = truth_folder / f"{capture}_noisy.h5" if capture == VALIDATION else bench_folder / f"{capture}.h5"
         write_capture(target, bench, digitize(bench, exposed, random), angles, sample=sample, instrument=text)
         np.save(truth_folder / f"{capture}.npy", true_mueller(scene, pixels))

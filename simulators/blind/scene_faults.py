@@ -52,14 +52,14 @@ def turned_analyzer(instrument: InstrumentModel, error_deg: float) -> Instrument
 
 
 def _turned(elements: tuple[Any, ...], error_deg: float) -> tuple[Any, ...]:
-    turned = []
+    train = []
     for element in elements:
         if not isinstance(element, Polarizer | Retarder):
             raise ValueError(f"a {element.kind} cannot be turned")
         azimuth = element.azimuth_deg
         new = {k: v + error_deg for k, v in azimuth.items()} if isinstance(azimuth, dict) else azimuth + error_deg
-        turned.append(element.model_copy(update={"azimuth_deg": new}))
-    return tuple(turned)
+        train.append(element.model_copy(update={"azimuth_deg": new}))
+    return tuple(train)
 
 
 class LitSupport:

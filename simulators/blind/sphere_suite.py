@@ -84,8 +84,8 @@ def _add_fault(kind: str, random: np.random.Generator, so_far: SphereFault) -> S
         raise ValueError(f"{kind} has to be put in before what stands in front of the scene")
     if kind == "registration":
         truth = {n: random.uniform(-s, s) for n, s in (("x", 0.8), ("y", 0.8), ("scale", 0.03))}
-        moved = scene_faults.moved_sphere(scene, truth["x"], truth["y"], truth["scale"])
-        return _extend(so_far, kind, truth, scene=moved)
+        shifted = scene_faults.moved_sphere(scene, truth["x"], truth["y"], truth["scale"])
+        return _extend(so_far, kind, truth, scene=shifted)
     if kind == "interreflection":
         towards, uneven = random.uniform(0, 2 * math.pi), random.uniform(0, 0.6)
         support = scene_faults.LitSupport(
@@ -106,11 +106,11 @@ def _add_fault(kind: str, random: np.random.Generator, so_far: SphereFault) -> S
         return _extend(so_far, kind, {"a": a, "log_b": float(np.log(b / 2))}, scene=surface, material=believed)
     if kind == "refractive_index":
         truth = {"n": random.uniform(-0.2, 0.2), "k": random.uniform(-0.06, 0.07)}
-        wrong = {
+        changed = {
             nm: c.model_copy(update={"n": c.n - truth["n"], "k": c.k - truth["k"]})
             for nm, c in so_far.material.constants.items()
         }
-        return _extend(so_far, kind, truth, material=so_far.material.model_copy(update={"constants": wrong}))
+        return _extend(so_far, kind, truth, material=so_far.material.model_copy(update={"constants": changed}))
     raise ValueError(f"no fault {kind!r}; there are none, two, {', '.join((*LISTED, *UNLISTED))}")
 
 

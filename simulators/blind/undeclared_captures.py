@@ -191,17 +191,17 @@ def expose(bench: TrueBench, scene: TrueScene, angles_deg: dict[str, Array]) -> 
     n = next(iter(angles_deg.values())).size
     ys, xs = np.mgrid[0 : bench.rows, 0 : bench.columns].astype(float)
     out = np.zeros((n, bench.rows, bench.columns))
-    still = (
+    constant_m = (
         None if bench.shift or bench.material_level or bench.turned else scene.at(xs / bench.columns, ys / bench.rows)
     )
     for k in range(n):
         angles = {axis: float(np.deg2rad(v[k])) for axis, v in angles_deg.items()}
         for hook in bench.angles:
             angles = hook(k, angles)
-        m = still
+        m = constant_m
         if m is None:
-            moved = [(0.0, 0.0), *(s(k, angles) for s in bench.shift)]
-            dx, dy = (sum(parts) for parts in zip(*moved, strict=True))
+            shifts = [(0.0, 0.0), *(s(k, angles) for s in bench.shift)]
+            dx, dy = (sum(parts) for parts in zip(*shifts, strict=True))
             levels = np.ones(4)
             for material, course in bench.material_level:
                 levels[material] *= course(k)
@@ -229,12 +229,12 @@ def _turned(scene: TrueScene, bench: TrueBench, xs: Array, ys: Array, *, angle: 
     c, s = np.cos(angle), np.sin(angle)
     x, y = xs - (bench.columns - 1) / 2, ys - (bench.rows - 1) / 2
     # Rows run downwards: counter-clockwise as seen is clockwise in (column, row).
-    back = scene.at(
+    unrotated = scene.at(
         (c * x - s * y + (bench.columns - 1) / 2) / bench.columns, (s * x + c * y + (bench.rows - 1) / 2) / bench.rows
     )
     c, s = np.cos(2 * angle), np.sin(2 * angle)
     r = np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]])
-    return np.asarray(r @ back @ r.T)
+    return np.asarray(r @ unrotated @ r.T)
 
 
 def _sample_mosaic(light: Array) -> Array:

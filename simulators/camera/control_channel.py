@@ -91,20 +91,20 @@ class ControlChannel:
         channel, self._socket = self._socket, None
         if channel is not None and self._thread is not None:
             self._thread.join()
-            for heard in self._listeners:
-                heard.close()
+            for sock in self._listeners:
+                sock.close()
 
     def _serve(self, channel: socket.socket) -> None:
         while self._socket is channel:
             # What waits was sent while this thread had no turn: its sender was not silent.
             if not select.select([channel], [], [], 0)[0]:
                 self._release_silent_controller()
-            for heard in select.select(self._listeners, [], [], _SLICE_S)[0]:
+            for sock in select.select(self._listeners, [], [], _SLICE_S)[0]:
                 # The port of somebody who is gone; the next packet is another's. A packet that is too short for what it
                 # says is nobody's command.
                 with contextlib.suppress(struct.error, OSError):
-                    packet, sender = heard.recvfrom(2048)
-                    if heard is channel or packet[2:4] == struct.pack(">H", _DISCOVERY):
+                    packet, sender = sock.recvfrom(2048)
+                    if sock is channel or packet[2:4] == struct.pack(">H", _DISCOVERY):
                         self._answer(channel, packet, sender)
 
     def _release_silent_controller(self) -> None:
@@ -142,8 +142,8 @@ class ControlChannel:
             device.resend(frame_id, first & 0xFFFFFF, last & 0xFFFFFF)
             return _DONE, b""
         if command == _WRITE_REGISTERS:
-            written = [(content[at : at + 4], content[at + 4 : at + 8]) for at in range(0, len(content) - 7, 8)]
-            return self._write([(struct.unpack(">I", where)[0], data) for where, data in written], sender)
+            pairs = [(content[i : i + 4], content[i + 4 : i + 8]) for i in range(0, len(content) - 7, 8)]
+            return self._write([(struct.unpack(">I", where)[0], data) for where, data in pairs], sender)
         if command == _WRITE_MEMORY:
             return self._write([(struct.unpack_from(">I", content)[0], content[4:])], sender)
         return _NOT_IMPLEMENTED, b""

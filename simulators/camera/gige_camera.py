@@ -170,7 +170,7 @@ class GigeCamera:
                 except NodeError:
                     continue
         tops = range(0xFF00_0000, 0, -_MOST_XML_BYTES)
-        return next(at for at in tops if not any(register.overlaps(at, _MOST_XML_BYTES) for register in registers))
+        return next(top for top in tops if not any(register.overlaps(top, _MOST_XML_BYTES) for register in registers))
 
     # --- life --------------------------------------------------------------------------------------------
 

@@ -71,27 +71,27 @@ def _float(name: str, address: int, low: float, high: float, *, access: str = "R
 
 
 def _choice(name: str, address: int, entries: dict[str, int], index: str = "") -> str:
-    listed = "".join(
+    items = "".join(
         f'<EnumEntry Name="{entry}" NameSpace="Standard"><Value>{value}</Value></EnumEntry>'
         for entry, value in entries.items()
     )
     return (
-        f'<Enumeration Name="{name}" NameSpace="Standard">{listed}<pValue>{name}Register</pValue></Enumeration>'
+        f'<Enumeration Name="{name}" NameSpace="Standard">{items}<pValue>{name}Register</pValue></Enumeration>'
         f"{_register(name, address, index=index)}"
     )
 
 
 def _selector(name: str, entries: Sequence[str]) -> str:
-    listed = "".join(f'<EnumEntry Name="{e}"><Value>{i}</Value></EnumEntry>' for i, e in enumerate(entries))
+    items = "".join(f'<EnumEntry Name="{e}"><Value>{i}</Value></EnumEntry>' for i, e in enumerate(entries))
     return (
-        f'<Integer Name="{name}Value"><Value>0</Value></Integer><Enumeration Name="{name}">{listed}'
+        f'<Integer Name="{name}Value"><Value>0</Value></Integer><Enumeration Name="{name}">{items}'
         f"<pValue>{name}Value</pValue></Enumeration>"
     )
 
 
 def _formula(name: str, formula: str, **variables: str) -> str:
-    listed = "".join(f'<pVariable Name="{short}">{feature}</pVariable>' for short, feature in variables.items())
-    return f'<IntSwissKnife Name="{name}" NameSpace="Standard">{listed}<Formula>{formula}</Formula></IntSwissKnife>'
+    items = "".join(f'<pVariable Name="{short}">{feature}</pVariable>' for short, feature in variables.items())
+    return f'<IntSwissKnife Name="{name}" NameSpace="Standard">{items}<Formula>{formula}</Formula></IntSwissKnife>'
 
 
 def _flag(name: str, address: int, access: str = "RW", index: str = "") -> str:
@@ -150,14 +150,14 @@ def description(table: NodeMap, width: int, height: int) -> str:
         _payload_size(table),
     ]
     names = re.findall(r'<(?!EnumEntry)\w+ Name="(\w+)" NameSpace="Standard">', "".join(features))
-    listed = "".join(f"<pFeature>{name}</pFeature>" for name in names)
+    items = "".join(f"<pFeature>{name}</pFeature>" for name in names)
     return (
         f'<?xml version="1.0" encoding="utf-8"?>\n<RegisterDescription'
         f" ModelName={quoteattr(table.model)} VendorName={quoteattr(table.vendor)}"
         ' StandardNameSpace="None" SchemaMajorVersion="1" SchemaMinorVersion="0" SchemaSubMinorVersion="1"'
         ' MajorVersion="1" MinorVersion="0" SubMinorVersion="0" ProductGuid="0" VersionGuid="0"'
         ' xmlns="http://www.genicam.org/GenApi/Version_1_0">\n'
-        f'<Category Name="Root" NameSpace="Standard">{listed}</Category>\n'
+        f'<Category Name="Root" NameSpace="Standard">{items}</Category>\n'
         + "\n".join([*features, '<Port Name="Device"/>'])
         + "\n</RegisterDescription>\n"
     )
@@ -206,8 +206,8 @@ def _maximum(name: str, pixels: int, axis: str, *, angles: bool) -> str:
     if not angles:
         return _formula(name, f"{pixels} / (B * D)", **factors)
     # Four counts a pixel, which is a super-pixel of the sensor.
-    together = "((((F &gt;&gt; 16) &amp; 0xFF) &gt; 16) ? 2 : 1)"
-    return _formula(name, f"{pixels} / (B * D * {together})", **factors, F="PixelFormatRegister")
+    factor = "((((F &gt;&gt; 16) &amp; 0xFF) &gt; 16) ? 2 : 1)"
+    return _formula(name, f"{pixels} / (B * D * {factor})", **factors, F="PixelFormatRegister")
 
 
 def _acquisition(table: NodeMap) -> list[str]:

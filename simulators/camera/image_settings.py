@@ -77,9 +77,9 @@ def processed(settings: Settings, info: ExposureInfo, counts: NDArray[np.uint16]
     if shift := settings.number("DigitalShift"):
         value = value * 2.0**shift
     out = counts if value is counts else np.clip(np.rint(value), 0, top).astype(np.uint16)
-    lost = max(0, bits - _converter_bits(settings, bits))
-    if lost:
-        out = out >> np.uint16(lost) << np.uint16(lost)
+    lost_bits = max(0, bits - _converter_bits(settings, bits))
+    if lost_bits:
+        out = out >> np.uint16(lost_bits) << np.uint16(lost_bits)
     if any(settings.entry(name) == "On" for name in ("GevSCPSBigEndian", "pgrPixelBigEndian")) and bits > 8:
         out = out.byteswap() & np.uint16(top)
     return out

@@ -57,8 +57,8 @@ class LoopbackAddress:
         while True:
             fallbacks = [entry for entry in addresses if entry != self.address] if self._elsewhere else []
             for address in (self.address, *fallbacks):
-                if (held := self._bound(address)) is not None:
-                    self.address, self._socket = address, held
+                if (bound := self._bound(address)) is not None:
+                    self.address, self._socket = address, bound
                     return
             if time.monotonic() > deadline_s:
                 raise self._error(
@@ -70,24 +70,24 @@ class LoopbackAddress:
 
     def _bound(self, address: str) -> socket.socket | None:
         """The lock of an address, None where another camera has it. Raises CameraError."""
-        held = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        holder = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
-            held.bind(f"\0umov simulated camera {address}")
+            holder.bind(f"\0umov simulated camera {address}")
             # Cameras that were started by other programs do not know our lock, but they have the port.
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
                 probe.bind((address, _CONTROL_PORT))
         except OSError as error:
-            held.close()
+            holder.close()
             if error.errno == errno.EADDRINUSE:
                 return None
             raise self._error(str(error.strerror), f"Add it: ip addr add {address}/8 dev lo") from error
-        return held
+        return holder
 
     def release(self) -> None:
         """Let the next camera have the address; releasing twice is harmless."""
-        held, self._socket = self._socket, None
-        if held is not None:
-            held.close()
+        holder, self._socket = self._socket, None
+        if holder is not None:
+            holder.close()
 
     def _error(self, came_back: str, what_to_do: str) -> CameraError:
         return CameraError(f"start a simulated camera at {self.address}", came_back, what_to_do)

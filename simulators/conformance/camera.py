@@ -183,17 +183,17 @@ class CameraConformance:
         assert camera.full_scale == 2**twin.bits - 1
 
     def test_settings_are_read_back_and_hold_for_the_next_frame(self, twin: CameraTwin, camera: Camera) -> None:
-        back = camera.configure(CameraSettings(exposure_s=0.0123, width=64, height=32))
-        assert back.exposure_s == pytest.approx(0.0123, rel=1e-3)
-        assert (back.width, back.height) == (64, 32)
-        assert camera.settings == back
+        applied = camera.configure(CameraSettings(exposure_s=0.0123, width=64, height=32))
+        assert applied.exposure_s == pytest.approx(0.0123, rel=1e-3)
+        assert (applied.width, applied.height) == (64, 32)
+        assert camera.settings == applied
         frame = camera.capture()[0]
         assert frame.pixels.shape == (32, 64)
         assert read_stamp(frame.pixels)[1] == pytest.approx(0.0123, rel=1e-3)
         # No region asked for is the full sensor again, and a setting left open stays.
-        back = camera.configure(CameraSettings())
-        assert (back.width, back.height) == twin.size
-        assert back.exposure_s == pytest.approx(0.0123, rel=1e-3)
+        applied = camera.configure(CameraSettings())
+        assert (applied.width, applied.height) == twin.size
+        assert applied.exposure_s == pytest.approx(0.0123, rel=1e-3)
 
     @pytest.mark.parametrize(
         "wrong", [{"exposure_s": 1e6}, {"width": 99999}, {"width": 64, "offset_x": 99990}, {"pixel_format": "Nonsense"}]
@@ -223,12 +223,12 @@ class CameraConformance:
         assert scene.exposures == camera.statistics().completed == 8
 
     def test_an_average_keeps_saturated_pixels_saturated(self, twin: CameraTwin) -> None:
-        shown: list[int] = []
+        frames: list[int] = []
 
         def flicker(width: int, height: int, exposure_s: float) -> NDArray[np.uint16]:
-            shown.append(len(shown))
-            pixels = np.full((height, width), 100 + 3 * len(shown), np.uint16)
-            pixels[0, 0] = 2**twin.bits - 1 if len(shown) == 2 else 0
+            frames.append(len(frames))
+            pixels = np.full((height, width), 100 + 3 * len(frames), np.uint16)
+            pixels[0, 0] = 2**twin.bits - 1 if len(frames) == 2 else 0
             return pixels
 
         twin.stop()
@@ -239,7 +239,7 @@ class CameraConformance:
                 camera.configure(CameraSettings(exposure_s=1e-3, frame_average=4))
                 exposure = camera.trigger()
                 exposure.wait_exposed()
-                assert len(shown) == 4
+                assert len(frames) == 4
                 frame = exposure.frame()
                 assert frame.pixels[1, 1] == 108  # the mean of 103, 106, 109, 112 is 107.5
                 assert frame.pixels[0, 0] == camera.full_scale
@@ -320,9 +320,9 @@ class CameraConformance:
         camera.close()
         assert patient_clock().now_s() - closing_s < 1
         twin.start()
-        with self.open(twin.entry) as again:
-            again.configure(SHORT)
-            assert read_stamp(again.capture()[0].pixels)[2] == scene.exposures
+        with self.open(twin.entry) as reopened:
+            reopened.configure(SHORT)
+            assert read_stamp(reopened.capture()[0].pixels)[2] == scene.exposures
 
     def test_a_second_program_is_refused_and_the_first_goes_on(self, twin: CameraTwin, camera: Camera) -> None:
         with pytest.raises(CameraBusy):

@@ -80,12 +80,12 @@ class EffectConformance:
         place = effect.places(model, capture.conditions)[-1]
         parameters = effect.parameters(model, capture.conditions, place)
         space = Space((Candidate(effect, place, parameters, 0 if effect.of_one_capture else None),))
-        at = 0.3 * space.joined("typical") * np.random.default_rng(2).uniform(0.5, 1, space.size)
-        gradient = 2 * problem.sums(space, at).gradient.sum(axis=0)
+        values = 0.3 * space.joined("typical") * np.random.default_rng(2).uniform(0.5, 1, space.size)
+        gradient = 2 * problem.sums(space, values).gradient.sum(axis=0)
         for j in np.unique([0, space.size - 1]):
             step = np.zeros(space.size)
             step[j] = 1e-4 * space.joined("typical")[j]
-            up, down = (problem.sums(space, at + s, derivatives=False).excess.sum() for s in (step, -step))
+            up, down = (problem.sums(space, values + s, derivatives=False).excess.sum() for s in (step, -step))
             slope = (up - down) / (2 * step[j])
             scale = abs(gradient).max() + 1.0 / space.joined("typical")[j]
             # The noise of second derivatives is left out of the slope of image shifts (a share of a percent).

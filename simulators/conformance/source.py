@@ -81,9 +81,9 @@ class SourceConformance:
         source.set_light(True)
         source.close()
         assert served.true_light()
-        again = served.open()
+        reopened = served.open()
         assert served.true_light()
-        assert again.is_on()
+        assert reopened.is_on()
 
     def test_light_goes_on_and_off_and_is_read_back(self, served: ServedSource) -> None:
         source = served.open()

@@ -121,8 +121,8 @@ class GCS2Emulator(Emulator):
             "ACC?": lambda stage: f"{stage.axis.acceleration_deg_s2:.4f}",
         }
         if command in questions:
-            chosen = words or [str(index + 1) for index in range(len(self.stages))]
-            return _lines(f"{axis}={questions[command](self._stage(axis))}" for axis in chosen)
+            axes = words or [str(index + 1) for index in range(len(self.stages))]
+            return _lines(f"{axis}={questions[command](self._stage(axis))}" for axis in axes)
         self._act(command, words)
         return None
 

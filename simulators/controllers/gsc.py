@@ -73,8 +73,8 @@ class GSCEmulator(Emulator):
         # Signs stand at the left of ten places.
         pulses = [self.pulses(index) for index in range(len(self.axes))]
         places = [f"{'-' if count < 0 else ' '}{abs(count):9d}" for count in pulses]
-        stopped = [not axis.is_moving() and axis.position_deg() in (axis.min_deg, axis.max_deg) for axis in self.axes]
-        at_limit = "W" if stopped == [True, True] else "L" if stopped[0] else "M" if any(stopped) else "K"
+        is_at_end = [not axis.is_moving() and axis.position_deg() in (axis.min_deg, axis.max_deg) for axis in self.axes]
+        at_limit = "W" if is_at_end == [True, True] else "L" if is_at_end[0] else "M" if any(is_at_end) else "K"
         return ",".join((*places, "K" if self._is_accepted else "X", at_limit, self._busy()))
 
     def _chosen(self, selection: str) -> list[int]:
@@ -91,9 +91,9 @@ class GSCEmulator(Emulator):
         if (move := _SET.fullmatch(text)) is not None:
             return self._set(move[1] == "A", self._chosen(move[2]), re.findall(r"([+-])P(\d+)", move[3]))
         if (jog := _JOG.fullmatch(text)) is not None:
-            chosen = self._chosen(jog[1])
-            self._next = dict(zip(chosen, jog[2], strict=False))
-            return bool(chosen) and len(chosen) == len(jog[2])
+            indices = self._chosen(jog[1])
+            self._next = dict(zip(indices, jog[2], strict=False))
+            return bool(indices) and len(indices) == len(jog[2])
         if text == ("G:" if self.acknowledges else "G"):
             return self._drive()
         if (speed := _SPEED.fullmatch(text)) is not None:
@@ -159,13 +159,13 @@ class GSCEmulator(Emulator):
         return bool(nexts)
 
     def _stop(self, selection: str) -> bool:
-        chosen = self._chosen(selection)
-        for index in chosen:
+        indices = self._chosen(selection)
+        for index in indices:
             # While it homes, a GSC-02 obeys what is meant for all axes alone.
             if selection == "W" or self.acknowledges or not self.axes[index].homing:
                 self.axes[index].stop()
         self._next = {}
-        return bool(chosen)
+        return bool(indices)
 
 
 def _make(axes: int, options: ServeOptions) -> GSCEmulator:

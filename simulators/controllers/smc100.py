@@ -285,10 +285,10 @@ class SMC100Emulator(Emulator):
         number, letters, value = match[1], match[2].upper(), match[3]
         if number in ("", "0"):
             # A stop without an address goes to all.
-            chosen = list(self.controllers.values()) if letters == "ST" else []
+            controllers = list(self.controllers.values()) if letters == "ST" else []
         else:
-            chosen = [self.controllers[int(number)]] if int(number) in self.controllers else []
-        for controller in chosen:
+            controllers = [self.controllers[int(number)]] if int(number) in self.controllers else []
+        for controller in controllers:
             if self.clock.now_s() < controller.silent_until_s:
                 continue
             try:

@@ -46,11 +46,11 @@ class PositionCompare:
         if not self.on or math.isnan(there_deg):
             return
         count = round((self.high_deg - self.low_deg) / self.step_deg) + 1
-        passed = [self.low_deg + k * self.step_deg for k in range(count)]
+        crossed_deg = [self.low_deg + k * self.step_deg for k in range(count)]
         low, high = sorted((there_deg, here_deg))
         # What was on the mark at the last look has given its pulse.
-        passed = [deg for deg in passed if low <= deg <= high and deg != there_deg]
-        self.pulses_deg += passed if here_deg >= there_deg else passed[::-1]
+        crossed_deg = [deg for deg in crossed_deg if low <= deg <= high and deg != there_deg]
+        self.pulses_deg += crossed_deg if here_deg >= there_deg else crossed_deg[::-1]
 
 
 @dataclass
@@ -315,8 +315,8 @@ class XPSConversation(Emulator):
 
     def _do_advance(self) -> None:
         self._controller.gathering.look(self.clock.now_s())
-        for each in self._controller.groups.values():
-            each.compare.look(each.axis.position_deg())
+        for member in self._controller.groups.values():
+            member.compare.look(member.axis.position_deg())
         group = self._waits_for
         if group is not None and not group.axis.is_moving():
             self._waits_for = None

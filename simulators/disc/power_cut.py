@@ -26,13 +26,13 @@ class Call:
 def read_record(record: Path) -> Iterator[Call]:
     """Calls and notes in their order."""
     raw = record.read_bytes()
-    at = 0
-    while at < len(raw):
-        end = raw.index(b"\n", at)
-        kind, path, offset, size = raw[at:end].decode().split("\t")
+    position = 0
+    while position < len(raw):
+        end = raw.index(b"\n", position)
+        kind, path, offset, size = raw[position:end].decode().split("\t")
         length = int(size) if kind in ("write", "rename") else 0
         yield Call(kind, path, int(offset), raw[end + 1 : end + 1 + length])
-        at = end + 1 + length
+        position = end + 1 + length
 
 
 @dataclass
@@ -88,11 +88,11 @@ class UnreliableDisc:
         count = chance.randint(0, len(self._waiting)) if chance else 0
         for change in self._waiting[:count]:
             _rename(names, change)
-        lost = [path for path, file in self._names.items() if file.folder and path not in names]
+        lost_folders = [path for path, file in self._names.items() if file.folder and path not in names]
         return {
             path: _content(file, chance)
             for path, file in names.items()
-            if not file.folder and not any(path.startswith(f"{folder}/") for folder in lost)
+            if not file.folder and not any(path.startswith(f"{folder}/") for folder in lost_folders)
         }
 
 

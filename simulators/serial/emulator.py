@@ -115,10 +115,10 @@ class EmulatedAxis:
 
     def home(self, speed_deg_s: float | None = None) -> None:
         """Turn to the home switch, at the speed of moves unless another is given; the reference is there at the end."""
-        here_deg = self._motion.position(self.clock.now_s())
+        start_deg = self._motion.position(self.clock.now_s())
         self._homed = False
         # A rotary stage meets its switch once a turn.
-        turns = math.floor(here_deg / 360.0 + 1e-9) if self.min_deg is None else 0
+        turns = math.floor(start_deg / 360.0 + 1e-9) if self.min_deg is None else 0
         self._start(360.0 * turns, speed_deg_s)
         self.homing = True
 
@@ -128,16 +128,16 @@ class EmulatedAxis:
         if now_s >= self.end_s():
             return
         velocity = self._motion.velocity(now_s)
-        here_deg = self._motion.position(now_s)
+        start_deg = self._motion.position(now_s)
         self.homing = False
         if self.stuck or velocity == 0.0 or self.clock.instant:
-            self._motion = TrapezoidMotion(here_deg, here_deg, 1.0, 1.0, now_s)
+            self._motion = TrapezoidMotion(start_deg, start_deg, 1.0, 1.0, now_s)
             return
         braking_deg = velocity * abs(velocity) / (2 * self.acceleration_deg_s2)
         # The second half of a triangle that would peak here: it starts at this velocity and ends at rest.
         ramp_s = abs(velocity) / self.acceleration_deg_s2
         self._motion = TrapezoidMotion(
-            here_deg - braking_deg, here_deg + braking_deg, math.inf, self.acceleration_deg_s2, now_s - ramp_s
+            start_deg - braking_deg, start_deg + braking_deg, math.inf, self.acceleration_deg_s2, now_s - ramp_s
         )
 
     def set_stuck(self, stuck: bool) -> None:
@@ -158,18 +158,18 @@ class EmulatedAxis:
 
     def _start(self, mechanical_deg: float, speed_deg_s: float | None = None) -> None:
         now_s = self.clock.now_s()
-        here_deg = self._motion.position(now_s)
+        start_deg = self._motion.position(now_s)
         homing, self.homing = self.homing and self.stuck, False
         speed = (self.speed_deg_s if speed_deg_s is None else speed_deg_s) * self.speed_factor
         acceleration = self.acceleration_deg_s2 * self.speed_factor
         if self.stuck:
             self.homing = homing
             # Starts, and will not arrive: the controller sees a motion that goes nowhere.
-            self._motion = TrapezoidMotion(here_deg, here_deg + 1e-9, 1e-15, math.inf, now_s)
+            self._motion = TrapezoidMotion(start_deg, start_deg + 1e-9, 1e-15, math.inf, now_s)
         elif self.clock.instant:
-            self._motion = TrapezoidMotion(here_deg, mechanical_deg, math.inf, math.inf, now_s)
+            self._motion = TrapezoidMotion(start_deg, mechanical_deg, math.inf, math.inf, now_s)
         else:
-            self._motion = TrapezoidMotion(here_deg, mechanical_deg, speed, acceleration, now_s)
+            self._motion = TrapezoidMotion(start_deg, mechanical_deg, speed, acceleration, now_s)
 
     def _end_homing(self) -> None:
         self.homing = False

@@ -50,8 +50,8 @@ class WindowPlate(BenchEffect):
         plate = Retarder(
             kind="retarder", name="window", azimuth_deg=self.azimuth_deg, retardance_deg=self.retardance_deg
         )
-        at = names.index(self.behind) + 1
-        return model.model_copy(update={"generator": (*model.generator[:at], plate, *model.generator[at:])})
+        index = names.index(self.behind) + 1
+        return model.model_copy(update={"generator": (*model.generator[:index], plate, *model.generator[index:])})
 
 
 class PlateTransmission(BenchEffect):
@@ -81,8 +81,8 @@ class PlateRetardance(BenchEffect):
         plate = next(e for e in model.elements() if e.name == self.element)
         if plate.axis is None:
             raise KeyError(f"{self.element!r} does not turn")
-        turned = np.deg2rad(plate.ratio * shot.angles_deg[plate.axis] - self.phase_deg)
-        return with_element(model, self.element, retardance_deg=declared + self.amplitude_deg * float(np.cos(turned)))
+        phase = np.deg2rad(plate.ratio * shot.angles_deg[plate.axis] - self.phase_deg)
+        return with_element(model, self.element, retardance_deg=declared + self.amplitude_deg * float(np.cos(phase)))
 
 
 class FieldRetardanceFault(BenchEffect):

@@ -204,8 +204,8 @@ class FeatureValues:
             code = int(nodes.value("PixelFormat"))
             pixels = int(nodes.value("Width")) * int(nodes.value("Height"))
             chunks = self.time_chunk(0)
-            behind = 0 if chunks is None else _IMAGE_CHUNK_BYTES + sum(8 + len(data) for data in chunks.values())
-            tell(nodes, "PayloadSize", (pixels * (code >> 16 & 0xFF) + 7) // 8 + behind)
+            chunk_bytes = 0 if chunks is None else _IMAGE_CHUNK_BYTES + sum(8 + len(data) for data in chunks.values())
+            tell(nodes, "PayloadSize", (pixels * (code >> 16 & 0xFF) + 7) // 8 + chunk_bytes)
         self.show(exposing=self._exposing, armed=self._armed)
 
     def show(self, *, exposing: bool, armed: bool) -> None:

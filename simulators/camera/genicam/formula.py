@@ -166,8 +166,8 @@ class Formula:
         left = self._unary()
         while (sign := self._next()) in _BINARY and _BINARY[sign][0] >= loosest:
             self._position += 1
-            tight, does = _BINARY[sign]
-            left = _joined(does, left, self._binary(tight + 1))
+            precedence, operation = _BINARY[sign]
+            left = _joined(operation, left, self._binary(precedence + 1))
         return left
 
     def _unary(self) -> Term:

@@ -84,16 +84,16 @@ def follow(nodes: NodeTree, sensor: tuple[int, int]) -> None:
         ("Width", "OffsetX", "SensorWidth", "Horizontal", sensor[0]),
         ("Height", "OffsetY", "SensorHeight", "Vertical", sensor[1]),
     ):
-        sent = full // int(_optional(nodes, f"Binning{direction}") * _optional(nodes, f"Decimation{direction}"))
+        span = full // int(_optional(nodes, f"Binning{direction}") * _optional(nodes, f"Decimation{direction}"))
         registers: set[str] = set()
-        for name, value in ((sensor_size, full), (f"{size}Max", sent), (nodes.limit_node(size, "Max"), sent)):
+        for name, value in ((sensor_size, full), (f"{size}Max", span), (nodes.limit_node(size, "Max"), span)):
             if name is not None and name in nodes:
                 tell(nodes, name, value)
                 registers |= nodes.inputs(name)
         top = nodes.limit_node(offset, "Max") if offset in nodes else None
         # On some cameras an offset may be anywhere on the sensor, whatever the width.
         if top is not None and not registers & nodes.inputs(top):
-            tell(nodes, top, max(0, sent - int(nodes.value(size))))
+            tell(nodes, top, max(0, span - int(nodes.value(size))))
 
 
 def tell(nodes: NodeTree, name: str, value: Number) -> bool:
