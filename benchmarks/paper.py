@@ -37,17 +37,17 @@ def run(work: Path, out: Path, size: Size, pool: Executor, *, figure: Path | Non
     def say(text: str) -> None:
         print(f"{time.perf_counter() - begin:6.0f} s  {text}", flush=True)
 
-    def taken(number: int) -> Path:
-        begin = time.perf_counter()
+    def take_part(number: int) -> Path:
+        part_begin = time.perf_counter()
         part = parts(size)[number]
         say(f"acquire: {part.name}")
         folder = take_captures(work, size, part)
-        seconds[f"captures of {part.name}"] = time.perf_counter() - begin
+        seconds[f"captures of {part.name}"] = time.perf_counter() - part_begin
         return folder
 
     # One camera is emulated at a time; what is taken is worked on while the next part is taken.
     with ThreadPoolExecutor(1) as bench:
-        folders = [bench.submit(taken, number) for number in range(3)]
+        folders = [bench.submit(take_part, number) for number in range(3)]
         sphere = study_sphere(folders[0].result(), work / "results/sphere", pool, say)
         body = study_body(folders[1].result())
         fault = study_fault(folders[2].result(), work / "results/fault", sphere, pool, say=say)
