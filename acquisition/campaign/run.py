@@ -25,12 +25,11 @@ from acquisition.capture.writer import PARTIAL, bytes_needed, seal_whole
 from acquisition.disc import on_disc
 from acquisition.errors import Differs, InterlockOpened, PlanRefused, Stopped, Unforeseen, as_run_error
 from acquisition.rig.config import RigConfig
-from acquisition.rig.continuous_rotation import states_deg, unwind
-from acquisition.rig.folded_angles import fold_angles
 from acquisition.rig.guarded import GUARD_LOG
 from acquisition.rig.interlocks import LOOK_S
 from acquisition.rig.open_rig import open_rig
 from acquisition.rig.rig import Rig
+from acquisition.rig.turns import fold_angles, states_deg, unwind
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
 from processing.instrument.model import InstrumentModel

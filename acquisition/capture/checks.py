@@ -11,8 +11,8 @@ import numpy as np
 from acquisition.capture.plan import ARM, AutoExposure, MeasurementPlan
 from acquisition.errors import PlanRefused
 from acquisition.rig.config import RigConfig
-from acquisition.rig.continuous_rotation import states_deg, turned, turns_to
 from acquisition.rig.rig import Rig
+from acquisition.rig.turns import add_turns, states_deg, turns_to
 from acquisition.rig.way import find_obstacle, find_way
 from drivers.axis_types import NO_LIMIT_DEG, Limits
 from drivers.errors import LimitError
@@ -199,7 +199,7 @@ def check_devices(
 
 
 def _check_first_move(table: StateTable, rig: Rig, state: int, here_deg: Mapping[str, float]) -> CheckResult:
-    poses = states_deg(turned(table, turns_to(table, rig, state, here_deg, preferred={})))
+    poses = states_deg(add_turns(table, turns_to(table, rig, state, here_deg, preferred={})))
     if find_way(rig.config, here_deg, poses[state], poses, limits=rig.limits, first=ARM) is None:
         obstacle = find_obstacle(rig.config, here_deg, {**here_deg, **poses[state]}, poses[state], limits=rig.limits)
         return CheckResult("first move", False, f"to state {state} it meets {obstacle}, and there is no way round it")

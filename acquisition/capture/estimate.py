@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 
 from acquisition.capture.job import Job
-from acquisition.rig.folded_angles import fold_angles
 from acquisition.rig.rig import Rig
+from acquisition.rig.turns import fold_angles
 
 #: Seconds that a frame takes to arrive and be written, where nothing overlaps it.
 FRAME_S = 0.05

@@ -24,8 +24,8 @@ from acquisition.capture.writer import bytes_needed, check_space
 from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
-from acquisition.rig.folded_angles import fold_angles
 from acquisition.rig.rig import Rig
+from acquisition.rig.turns import fold_angles
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import StateTable
 from processing.storage.captures.capture import Capture

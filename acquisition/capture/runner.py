@@ -19,9 +19,9 @@ from acquisition.capture.time_ledger import Entry, TimeLedger
 from acquisition.capture.wall_clock import WallClock
 from acquisition.capture.writer import CaptureWriter, StateRecord
 from acquisition.errors import RunFailed
-from acquisition.rig.continuous_rotation import states_deg, turned
 from acquisition.rig.interlocks import Interlocks
 from acquisition.rig.rig import Rig
+from acquisition.rig.turns import add_turns, states_deg
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
 from drivers.camera import CameraSettings, Exposure
@@ -99,7 +99,7 @@ class CaptureRunner:
         self.ledger = TimeLedger(rig.clock)
         self.messages = Messages()
         self.interlocks = Interlocks(rig, self.warn, continue_after_interlock)
-        self.poses_deg = states_deg(turned(table, turns or {}))
+        self.poses_deg = states_deg(add_turns(table, turns or {}))
         self._pose_deg: dict[str, float] = {}
         self._last_state: int | None = None
         self._light: bool | None = None

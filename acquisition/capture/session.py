@@ -20,10 +20,9 @@ from acquisition.capture.writer import CaptureWriter, as_partial
 from acquisition.cleanup import run_all
 from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError, Stopped, as_run_error
-from acquisition.rig.continuous_rotation import turns_to, unwind
-from acquisition.rig.folded_angles import fold_angles
 from acquisition.rig.interlocks import LightSoFar, light_so_far
 from acquisition.rig.rig import Rig
+from acquisition.rig.turns import fold_angles, turns_to, unwind
 from acquisition.screen.observer import Mosaic, Observer
 from acquisition.stop_request import StopRequest
 from processing.arrays import Array

@@ -1,4 +1,7 @@
-"""Rotators that may go on to the next turn instead of unwinding between captures."""
+"""Tables of states moved by turns: into the travel of an axis, and on to the next turn instead of unwinding.
+
+A polarizer or retarder is the same after a half turn, so its targets are folded by half turns.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,10 +12,23 @@ import numpy as np
 
 from acquisition.rig.rig import Rig
 from acquisition.rig.way import find_way
+from drivers.axis_types import Limits
 from processing.instrument.states import StateTable
 
 #: An endless axis unwinds once it has come this far: position counters are not endless.
 UP_TO_DEG = 36_000.0
+
+
+def fold_angles(table: StateTable, rig: Rig) -> StateTable:
+    """The table with the targets of every axis in `fold_deg` inside its limits, each as near to the last as can be.
+
+    A column that is inside already, or that no multiple brings inside, stays as it is.
+    """
+    angles = dict(table.angles_deg)
+    for name, period_deg in rig.config.fold_deg.items():
+        if name in angles:
+            angles[name] = _fold_column(angles[name], rig.axes[name].limits, float(period_deg))
+    return replace(table, angles_deg=angles)
 
 
 def unwind(table: StateTable, rig: Rig, here_deg: Mapping[str, float] | None = None) -> StateTable:
@@ -32,10 +48,10 @@ def unwind(table: StateTable, rig: Rig, here_deg: Mapping[str, float] | None = N
             turns = math.ceil((start_deg[name] - 1e-3 - float(table.angles_deg[name].min())) / 360.0)
             if turns > 0 and start_deg[name] < UP_TO_DEG:
                 ahead[name] = turns
-    return turned(table, turns_to(table, rig, 0, start_deg, preferred=ahead))
+    return add_turns(table, turns_to(table, rig, 0, start_deg, preferred=ahead))
 
 
-def turned(table: StateTable, turns: Mapping[str, int]) -> StateTable:
+def add_turns(table: StateTable, turns: Mapping[str, int]) -> StateTable:
     """The table with whole turns added to its axes."""
     angles = {name: column + 360.0 * turns.get(name, 0) for name, column in table.angles_deg.items()}
     return replace(table, angles_deg=angles)
@@ -57,7 +73,7 @@ def turns_to(
         choices.append(list(dict.fromkeys([preferred.get(name, 0), nearest, nearest + 1, nearest - 1, 0])))
     for chosen in product(*choices):
         turns = dict(zip(names, chosen, strict=True))
-        by = states_deg(turned(table, turns))
+        by = states_deg(add_turns(table, turns))
         if find_way(rig.config, here_deg, by[state], by, limits=rig.limits) is not None:
             return turns
     return dict(preferred)
@@ -66,6 +82,22 @@ def turns_to(
 def states_deg(table: StateTable) -> list[dict[str, float]]:
     """Angle of each axis in each state."""
     return [{axis: float(column[k]) for axis, column in table.angles_deg.items()} for k in range(len(table))]
+
+
+def _fold_column(column: np.ndarray, limits: Limits, period_deg: float) -> np.ndarray:
+    low = -math.inf if limits.min_deg is None else limits.min_deg
+    high = math.inf if limits.max_deg is None else limits.max_deg
+    if np.all((low <= column) & (column <= high)):
+        return column
+    targets = np.empty_like(column)
+    last_deg = (low + high) / 2 if math.isfinite(low + high) else float(column[0])
+    for k, angle in enumerate(column):
+        nearest = angle + period_deg * round((last_deg - angle) / period_deg)
+        inside = [a for a in (nearest, nearest - period_deg, nearest + period_deg) if low <= a <= high]
+        if not inside:
+            return column
+        targets[k] = last_deg = min(inside, key=lambda a: abs(a - last_deg))
+    return targets
 
 
 def _endless(table: StateTable, rig: Rig) -> Sequence[str]:
