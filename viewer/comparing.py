@@ -18,9 +18,9 @@ from processing.storage.captures.capture import Capture
 from processing.storage.products.images import MuellerImage, difference_errors, element_gradient
 from processing.storage.products.product import Product, is_lit, is_product
 from processing.storage.products.provenance import content_of
-from viewer.frames import chosen
+from viewer.frames import chosen_frame
 from viewer.pages import file_of, pages_of
-from viewer.planes import Window, sent
+from viewer.planes import Window, plane_response
 from viewer.products import DERIVED, choices_of, is_whole, named, read_map, units_words
 
 #: Errors at the ends of the scale of a difference over its error.
@@ -64,7 +64,7 @@ def _choices(a: Path, b: Path) -> tuple[list[dict[str, Any]], tuple[int, int]]:
 
 
 def states_to_choose(capture: Capture) -> list[dict[str, Any]]:
-    """The states done of a capture, as `chosen` reads them."""
+    """The states done of a capture, as `chosen_frame` reads them."""
     return [
         {"label": f"state {number}, {role}", "state": k}
         for k, (number, role) in enumerate(zip(capture.done, capture.role, strict=True))
@@ -91,7 +91,7 @@ def difference(request: Request) -> Response:
     if is_product(a):
         with Product(a) as first, Product(b) as second:
             _same_shape(first.shape, second.shape)
-            window = Window.asked(query, first.shape, most=640)
+            window = Window.parse(query, first.shape, most=640)
             plane_a, plane_b = (product_values(product, query, window) for product in (first, second))
             shared = _shared_errors(first, second, query, window)
             systematic = _systematic_errors(first, second, query, window)
@@ -102,7 +102,7 @@ def difference(request: Request) -> Response:
         shared, systematic = None, np.zeros(())
         with Capture(a) as early, Capture(b) as late:
             _same_shape(early.frame_shape, late.frame_shape)
-            window = Window.asked(query, early.frame_shape, most=640)
+            window = Window.parse(query, early.frame_shape, most=640)
             plane_a, plane_b = (capture_values(capture, query, window) for capture in (early, late))
             name, units, scale = None, "counts", ColourScale(LIGHT, *_ends(plane_a[0]))
     deviation = plane_a[0] - plane_b[0]
@@ -113,7 +113,7 @@ def difference(request: Request) -> Response:
         significance = deviation / np.hypot(noise, systematic)
     wide = scale_of("deviation", "", deviation)
     scales = [scale, scale, wide, ColourScale(SIGNED, -ERRORS_SHOWN, ERRORS_SHOWN)]
-    return sent(
+    return plane_response(
         window,
         np.stack([plane_a[0], plane_b[0], deviation, significance]).astype(np.float32),
         scales=[{"colours": s.colours, "low": s.low, "high": s.high} for s in scales],
@@ -220,7 +220,7 @@ def _derived(image: MuellerImage, name: str) -> Derived:
 
 def capture_values(capture: Capture, query: Any, window: Window) -> Measured:
     """Counts of the state that a request chooses in a window, with the noise of light and camera."""
-    state, channel = chosen(capture, query)
+    state, channel = chosen_frame(capture, query)
     counts = window.mean(capture.frames(state, window.rows)[channel])
     detector = capture.header.detector
     noise = NoiseModel.of(detector, integer=capture.integer_counts)

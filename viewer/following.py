@@ -25,14 +25,14 @@ async def events(request: Request) -> StreamingResponse:
 
     def look() -> dict[str, Any]:
         try:
-            return seen(folder, library)
+            return run_state(folder, library)
         except ProcessError as error:
             return {"running": False, "error": str(error)}
 
     return event_stream(request, look)
 
 
-def seen(folder: Path, library: Library) -> dict[str, Any]:
+def run_state(folder: Path, library: Library) -> dict[str, Any]:
     """What a page shows of a running campaign, or that none runs."""
     run = running_in(folder)
     view = read_campaign(folder, library, None if run is None else run.get("capture"))

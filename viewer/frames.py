@@ -15,7 +15,7 @@ from viewer.diagnoses import Diagnoses
 from viewer.library import Entry, outputs_of
 from viewer.notes import Note, notes_of
 from viewer.pages import file_of, pages_of
-from viewer.planes import Window, sent
+from viewer.planes import Window, plane_response
 from viewer.starting import geometry_files, instrument_files, material_files
 
 #: Most bars of a histogram.
@@ -53,7 +53,7 @@ def capture(request: Request) -> HTMLResponse:
         states=states,
         first=next((k for k, role in enumerate(states["role"]) if role != "dark"), 0),
         made=[(e, pages.shown_at(e)) for e in outputs_of(entry, entries, library.root)],
-        others=others(entry, entries),
+        others=comparable_files(entry, entries),
         writing=entry.status == "running",
         instruments=list(instrument_files(library)),
         materials=list(material_files(library)),
@@ -62,7 +62,7 @@ def capture(request: Request) -> HTMLResponse:
     )
 
 
-def others(entry: Entry, entries: list[Entry]) -> list[Entry]:
+def comparable_files(entry: Entry, entries: list[Entry]) -> list[Entry]:
     """Files of the same kind and mode, to compare with."""
     mode = None if entry.header is None else entry.header.mode
     same_kind = [e for e in entries if e.kind == entry.kind and e is not entry]
@@ -101,21 +101,21 @@ def frame(request: Request) -> Response:
     """Part of a frame: two pictures, mean counts and where a pixel is saturated (1, else 0)."""
     path, query = file_of(request), request.query_params
     with Capture(path) as record:
-        state, channel = chosen(record, query)
-        window = Window.asked(query, record.frame_shape)
+        state, channel = chosen_frame(record, query)
+        window = Window.parse(query, record.frame_shape)
         counts = record.frames(state, window.rows)[channel]
         top = saturation(record)
     mean = window.mean(counts)
     red = np.zeros_like(mean) if top is None else window.largest(counts) >= top
-    return sent(window, np.stack([mean, red.astype(np.float32)]), state=state)
+    return plane_response(window, np.stack([mean, red.astype(np.float32)]), state=state)
 
 
 def preview(request: Request) -> Response:
     """A frame as a small picture (PNG): what is seen until the page's script has drawn the one that can be zoomed."""
     path, query = file_of(request), request.query_params
     with Capture(path) as record:
-        state, channel = chosen(record, query)
-        window = Window.asked({key: query[key] for key in ("most",) if key in query}, record.frame_shape, most=PREVIEW)
+        state, channel = chosen_frame(record, query)
+        window = Window.parse({key: query[key] for key in ("most",) if key in query}, record.frame_shape, most=PREVIEW)
         counts = record.frames(state)[channel]
         top, black = saturation(record), record.header.detector.black_level_counts
     mean = window.mean(counts)
@@ -127,7 +127,7 @@ def preview(request: Request) -> Response:
     return Response(png(picture), media_type="image/png")
 
 
-def chosen(opened: Capture, query: Any) -> tuple[int, int]:
+def chosen_frame(opened: Capture, query: Any) -> tuple[int, int]:
     """State (among those done; -1 is the last) and channel that a request asks for. Raises ProcessError."""
     done = len(opened.done)
     try:
@@ -144,7 +144,7 @@ def histogram(request: Request) -> JSONResponse:
     """Pixels of a frame by their counts: edges of the bars, pixels in each, and where the range ends."""
     path, query = file_of(request), request.query_params
     with Capture(path) as record:
-        state, channel = chosen(record, query)
+        state, channel = chosen_frame(record, query)
         counts = record.frames(state)[channel]
         top, black = saturation(record), record.header.detector.black_level_counts
     finite = counts[np.isfinite(counts)] if counts.dtype.kind == "f" else counts

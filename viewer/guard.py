@@ -36,7 +36,7 @@ class PageGuard:
             await PlainTextResponse(refusal, 403)(scope, receive, send)
             return
 
-        async def sent(message: Message) -> None:
+        async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 headers["Content-Security-Policy"] = POLICY
@@ -45,7 +45,7 @@ class PageGuard:
                 headers.setdefault("Cache-Control", "no-store")
             await send(message)
 
-        await self._app(scope, receive, sent)
+        await self._app(scope, receive, send_guarded)
 
     def _refusal(self, method: str, path: str, headers: Headers) -> str | None:
         host = headers.get("host", "")

@@ -29,7 +29,7 @@ class Window:
     step: int
 
     @classmethod
-    def asked(cls, query: Any, shape: tuple[int, int], most: int = MOST) -> "Window":
+    def parse(cls, query: Any, shape: tuple[int, int], most: int = MOST) -> "Window":
         """The part that a request asks for with x0, x1, y0, y1 and most; default: all of it.
 
         Raises
@@ -84,7 +84,7 @@ def _inside(first: float, last: float, length: int) -> slice:
     return slice(start, min(max(math.ceil(last), start + 1), length))
 
 
-def sent(window: Window, image: NDArray[Any], **facts: Any) -> Response:
+def plane_response(window: Window, image: NDArray[Any], **facts: Any) -> Response:
     """A picture as numbers: 4-byte floats row by row, the rest as JSON in a header."""
     header = {
         "x0": window.columns.start,

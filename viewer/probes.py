@@ -18,7 +18,7 @@ from processing.storage.captures.capture import Capture
 from processing.storage.products.images import neighbour_correlation
 from processing.storage.products.pixel_mask import Mask
 from processing.storage.products.product import COMPANIONS, Product
-from viewer.frames import chosen
+from viewer.frames import chosen_frame
 from viewer.library import Library, input_of
 from viewer.mosaic_probing import SuperPixelReducer
 from viewer.pages import file_of, pages_of
@@ -32,8 +32,8 @@ def curve_of(request: Request) -> JSONResponse:
 
 def _capture_probe(path: Path, query: Any) -> dict[str, Any]:
     with Capture(path) as capture:
-        region = Region.asked(query, capture.frame_shape)
-        raw = raw_curve(capture, region, chosen(capture, {"channel": query.get("channel", 0)})[1])
+        region = Region.parse(query, capture.frame_shape)
+        raw = raw_curve(capture, region, chosen_frame(capture, {"channel": query.get("channel", 0)})[1])
         running = capture.status == "running"
     if running:
         return raw | {"told": "The capture is being taken; the fit comes when it is complete."}
@@ -44,7 +44,7 @@ def matrix_of(request: Request) -> JSONResponse:
     """Mueller matrix of a pixel or a region of a capture, and what it decomposes into."""
     path = file_of(request)
     with Capture(path) as capture:
-        region = Region.asked(request.query_params, capture.frame_shape)
+        region = Region.parse(request.query_params, capture.frame_shape)
         if capture.status == "running":
             raise ProcessError("the capture is being taken")
     return JSONResponse({"where": str(region)} | _matrix(path, region, None))
@@ -89,7 +89,7 @@ def of_product(request: Request) -> JSONResponse:
 def _product_probe(path: Path, query: Any, library: Library) -> dict[str, Any]:
     with Product(path) as product:
         shape = product.shape
-        region = Region.asked(query, shape)
+        region = Region.parse(query, shape)
         answer: dict[str, Any] = {"where": str(region), "planes": _planes(product, region), "told": ""}
         if "pixel_flags" in product.names:
             bits = product.get("pixel_flags", region.rows)[:, region.columns]

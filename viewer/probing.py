@@ -30,7 +30,7 @@ class Region:
     columns: slice
 
     @classmethod
-    def asked(cls, query: Any, shape: tuple[int, int]) -> "Region":
+    def parse(cls, query: Any, shape: tuple[int, int]) -> "Region":
         """The region of a request, inside the image. Raises ProcessError where its numbers are none."""
         try:
             x0, y0 = int(query["x0"]), int(query["y0"])
@@ -118,7 +118,7 @@ class PixelReducer:
             except ProcessError as error:
                 raise ProcessError(f"{region}: {error}") from error
 
-    def told(self, region: Region) -> str:
+    def describe(self, region: Region) -> str:
         """How a region is reduced, in a few words."""
         model = self.reduction.model
         effects = f", {len(model.effects)} effect(s)" if model.effects else ""
@@ -153,7 +153,7 @@ def curve(reducer: PixelReducer, region: Region) -> dict[str, Any]:
         "residual": finite(residual),
         "chi_square": finite(np.sum(residual**2) / degrees_of_freedom),
         "noise_known": bool(np.isfinite(image.noise_slope).all()),
-        "told": reducer.told(region),
+        "told": reducer.describe(region),
     }
 
 

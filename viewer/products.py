@@ -14,11 +14,11 @@ from processing.reports.colours import ALL, LIGHT, SIGNED, ColourScale, period_d
 from processing.reports.fact_words import fact_lines
 from processing.storage.products.product import COMPANIONS, Product, is_lit
 from processing.storage.products.provenance import steps_text
-from viewer.frames import others
+from viewer.frames import comparable_files
 from viewer.library import inputs_of, outputs_of
 from viewer.notes import Note, notes_of
 from viewer.pages import file_of, pages_of
-from viewer.planes import Window, sent
+from viewer.planes import Window, plane_response
 
 #: Kinds that hold Mueller matrices.
 MATRICES = ("mueller", "extrapolated")
@@ -60,7 +60,7 @@ def product(request: Request) -> HTMLResponse:
             for role, path, e in inputs_of(entry, entries, library.root)
         ],
         made=[(e, pages.shown_at(e)) for e in outputs_of(entry, entries, library.root)],
-        others=others(entry, entries),
+        others=comparable_files(entry, entries),
     )
 
 
@@ -114,10 +114,10 @@ def plane(request: Request) -> Response:
     path, query = file_of(request), request.query_params
     with Product(path) as opened:
         name, index = named(opened, query)
-        window = Window.asked(query, opened.shape)
+        window = Window.parse(query, opened.shape)
         values = read_map(opened, name, index, window)
         scale = scale_of(name, opened.units(name), values)
-        return sent(window, values[None], **told(scale, opened.units(name)))
+        return plane_response(window, values[None], **legend(scale, opened.units(name)))
 
 
 def read_map(opened: Product, name: str, index: int, window: Window) -> NDArray[np.float32]:
@@ -154,7 +154,7 @@ def named(opened: Product, query: Any) -> tuple[str, int]:
     return name, index
 
 
-def told(scale: ColourScale, units: str) -> dict[str, Any]:
+def legend(scale: ColourScale, units: str) -> dict[str, Any]:
     """A scale and a unit, for the page."""
     return {"colours": scale.colours, "low": scale.low, "high": scale.high, "units": units_words(units)}
 
@@ -164,11 +164,11 @@ def mueller(request: Request) -> Response:
     path, query = file_of(request), request.query_params
     with Product(path) as opened:
         opened.require(*MATRICES)
-        window = Window.asked(query, opened.shape, most=320)
+        window = Window.parse(query, opened.shape, most=320)
         elements, scale = read_mueller(opened, window, bool(query.get("normalized")), bool(query.get("errors")))
         light = scale_of("m00", "count", elements[0])
-    facts = told(scale, "" if query.get("normalized") else "counts") | {"light": light.high, "light_colours": LIGHT}
-    return sent(window, elements, **facts)
+    facts = legend(scale, "" if query.get("normalized") else "counts") | {"light": light.high, "light_colours": LIGHT}
+    return plane_response(window, elements, **facts)
 
 
 def read_mueller(

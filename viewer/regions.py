@@ -81,7 +81,7 @@ async def keep_region(request: Request) -> JSONResponse:
 
 def _keep_region(library: Library, fields: dict[str, str]) -> JSONResponse:
     shape = MeasuredImage(library.path(fields.get("file", ""))).shape
-    place, name = Region.asked(fields, shape), fields.get("name", "").strip()
+    place, name = Region.parse(fields, shape), fields.get("name", "").strip()
     if not NAME.fullmatch(name):
         raise ProcessError("a region has a name of up to 40 letters, digits, spaces and signs . ( ) + - _")
     columns, rows = ((part.start, part.stop) for part in (place.columns, place.rows))
@@ -111,7 +111,7 @@ def regions(request: Request) -> JSONResponse:
     """One quantity of an image in the region that the request names by x0 and y0, and in every named one."""
     path, query = file_of(request), request.query_params
     image = MeasuredImage(path)
-    areas = [("", Region.asked(query, image.shape))] if "x0" in query else []
+    areas = [("", Region.parse(query, image.shape))] if "x0" in query else []
     areas += _named_areas(pages_of(request).library, image.shape)
     return JSONResponse({"regions": [image.row(name, region, query) for name, region in areas]})
 

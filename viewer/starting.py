@@ -194,8 +194,8 @@ KINDS: dict[str, Callable[[Library, Jobs, dict[str, str]], PageJob]] = {
 def job(request: Request) -> HTMLResponse:
     """The page of a job."""
     pages, jobs = pages_of(request), jobs_of(request)
-    page_job = jobs.job(request.query_params.get("name", ""))
-    return pages.draw("job.html", simulated=_simulated(pages, page_job), job=page_job, now=told(pages, jobs, page_job))
+    entry = jobs.job(request.query_params.get("name", ""))
+    return pages.draw("job.html", simulated=_simulated(pages, entry), job=entry, now=job_state(pages, jobs, entry))
 
 
 def _simulated(pages: Pages, page_job: PageJob) -> bool:
@@ -209,7 +209,7 @@ def _simulated(pages: Pages, page_job: PageJob) -> bool:
         return False
 
 
-def told(pages: Pages, jobs: Jobs, page_job: PageJob) -> dict[str, Any]:
+def job_state(pages: Pages, jobs: Jobs, page_job: PageJob) -> dict[str, Any]:
     """What a page shows of a job: status, output, and where what it makes is shown."""
     status = jobs.status(page_job)
     links = []
@@ -232,7 +232,7 @@ async def job_events(request: Request) -> StreamingResponse:
     pages, jobs = pages_of(request), jobs_of(request)
     page_job = jobs.job(request.query_params.get("name", ""))
     return event_stream(
-        request, lambda: told(pages, jobs, page_job), lambda now: now["status"] not in ("running", "ended")
+        request, lambda: job_state(pages, jobs, page_job), lambda now: now["status"] not in ("running", "ended")
     )
 
 

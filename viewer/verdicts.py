@@ -15,7 +15,7 @@ from processing.reports.colours import ALL, PLAIN, SIGNED, steps
 from viewer.diagnoses import Diagnoses
 from viewer.library import NotHere
 from viewer.pages import fields_of, pages_of
-from viewer.planes import Window, sent
+from viewer.planes import Window, plane_response
 from viewer.probing import Region, finite
 
 
@@ -73,7 +73,7 @@ def residual_map(request: Request) -> Response:
     """Two pictures, before and after: the rms over the states, or one of them (`state`)."""
     residual = _chosen(request)
     query = request.query_params
-    window = Window.asked(query, residual.images["before"].shape[-2:])
+    window = Window.parse(query, residual.images["before"].shape[-2:])
     state = query.get("state")
     try:
         images = [
@@ -83,13 +83,13 @@ def residual_map(request: Request) -> Response:
         raise ProcessError(f"there is no state {state} in this diagnosis") from error
     colours = PLAIN if state is None else SIGNED
     pictures = np.stack([window.every(image[window.rows]) for image in images])
-    return sent(window, pictures, colours=colours, units="noise of one intensity")
+    return plane_response(window, pictures, colours=colours, units="noise of one intensity")
 
 
 def residual_curve(request: Request) -> JSONResponse:
     """Residual of each state, before and after, mean over a pixel or a region in units of the noise of that mean."""
     residual = _chosen(request)
-    region = Region.asked(request.query_params, residual.images["before"].shape[-2:])
+    region = Region.parse(request.query_params, residual.images["before"].shape[-2:])
     curves: dict[str, Any] = {"where": str(region)}
     for moment in MOMENTS:
         part = residual.images[moment][:, region.rows, region.columns].astype(float).reshape(-1, region.pixels)

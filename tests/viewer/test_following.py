@@ -19,7 +19,7 @@ from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from viewer.campaigns import read_campaign, seconds_left
-from viewer.following import seen
+from viewer.following import run_state
 from viewer.jobs import Jobs
 from viewer.lamp import lamp
 from viewer.library import Library, NotHere
@@ -48,7 +48,7 @@ def test_a_run_says_where_it_is_while_it_runs_and_nothing_afterwards(lab):
         assert (facts["capture"], facts["campaign_total"], facts["pending"]) == ("three.h5", 5, 44)
         assert "a wire is loose" in facts["messages"][0]
         assert facts["left_s"] >= 0
-        shown = seen(lab, Library(lab))
+        shown = run_state(lab, Library(lab))
         assert (shown["number"], shown["total"]) == (3, 5)
         # The axis stands at its second turn.
         assert shown["axes"] == {"psg": "0.000°", "lcr": "1.530 V"}
