@@ -9,7 +9,7 @@ Step = tuple[str, Callable[[], object]]
 
 
 def run_all(steps: Iterable[Step]) -> Exception | None:
-    """Run every step, whatever the others do; return the first failure with notes of the others, or None."""
+    """Run every step, also after a failure; return the first failure with notes of the others, or None."""
     first: Exception | None = None
     for name, step in steps:
         try:

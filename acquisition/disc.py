@@ -57,7 +57,7 @@ class SharedFrame:
         return np.frombuffer(self._memory, dtype, values).reshape(shape)
 
     def close(self) -> None:
-        """Let go of the memory once nobody holds an array of it."""
+        """Release the memory once no array of it exists."""
         self._memory = None
         os.close(self.file)
 
@@ -115,12 +115,12 @@ class DiscProcess:
         return future
 
     def call(self, task: str, function: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
-        """Call a function there and return what it returns.
+        """Call a function in the disc process and return its value.
 
         Raises
         ------
         AcquisitionError
-            The disc has not answered for DISC_S; what was begun ends when it answers.
+            The disc has not answered for DISC_S; the call ends when it answers.
         """
         future = self.submit(partial(function, **options), *arguments)
         while not wait([future], SLICE_S).done:
@@ -133,11 +133,11 @@ class DiscProcess:
         return future.result()
 
     def hurry(self) -> None:
-        """Wait for HASTE_S only from now on: the run has failed, or somebody wants its end."""
+        """Wait for HASTE_S only from now on: the run has failed, or the user ends it."""
         self._patience_s = HASTE_S
 
     def end(self) -> None:
-        """Let it finish what it was given and end; a disc that hangs is not waited for."""
+        """End the process after its last call; does not wait for a disc that hangs."""
         self._jobs.put(None)
         self._thread.join(HASTE_S)
         end_s = time.monotonic() + END_S
@@ -268,7 +268,7 @@ def _serve(line: Connection, frame: SharedFrame, dies_with: int) -> NoReturn:
         if dies_with:
             # Killed with its parent, as one process would be.
             ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        # What is here already is never collected: its pages stay shared.
+        # Objects that exist already are never collected: their pages stay shared.
         gc.freeze()
         while dies_with in (0, os.getppid()):
             function, arguments, shared, folder = line.recv()
@@ -296,7 +296,7 @@ def _send(line: Connection, answer: tuple[bool, Any]) -> None:
 
 
 def _close_all_but(*descriptors: int) -> None:
-    """Close what was inherited; the standard streams lead nowhere, so that nobody waits for their end."""
+    """Close inherited descriptors; the standard streams lead nowhere, so that no program waits for their end."""
     nothing = os.open(os.devnull, os.O_RDWR)
     for number in (0, 1, 2):
         os.dup2(nothing, number)

@@ -38,7 +38,7 @@ class RunFailed(AcquisitionError):
 
 
 class Unforeseen(RunFailed):
-    """An error that nobody foresaw ended a run: the program has a fault. Holds the traceback as text."""
+    """An unforeseen error ended a run: the program has a fault. Holds the traceback as text."""
 
     def __init__(self, error: BaseException) -> None:
         lines = traceback.extract_tb(error.__traceback__)
@@ -56,7 +56,7 @@ def as_run_error(error: Exception) -> Exception:
 
 
 class InterlockOpened(RunFailed):
-    """An interlock ended the run: somebody has to look before it goes on."""
+    """An interlock ended the run: an operator has to look before it continues."""
 
 
 class Stopped(AcquisitionError):
@@ -64,7 +64,7 @@ class Stopped(AcquisitionError):
 
 
 class Differs(AcquisitionError):
-    """What is there was begun with something else than what would go on now. Holds every difference."""
+    """A file was begun with another set-up than the present one. Holds every difference."""
 
     def __init__(self, subject: str, changes: list[str]) -> None:
         super().__init__(

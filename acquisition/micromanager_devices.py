@@ -27,7 +27,7 @@ from acquisition.rig.rig import Rig
 from drivers.errors import DeviceError
 from drivers.source import LightSource
 
-#: Labels of what is no axis; axes have their names in the rig file.
+#: Labels of the other devices; axes have their names in the rig file.
 CAMERA, SHUTTER = "Camera", "Light"
 
 
@@ -134,7 +134,7 @@ def rig_in_core(core: Any, rig_file: Path | str, sample: str = "red_sphere", hom
 
     Parameters
     ----------
-    sample : what an emulated rig shows.
+    sample : sample that an emulated rig shows.
     home : home axes without a reference now; nothing homes unless asked here or by the rig file.
     """
     config = load_rig(rig_file)

@@ -42,7 +42,7 @@ def take_capture(
     Raises
     ------
     AcquisitionError, DeviceError
-        It was refused, failed or was stopped; the message names what is left to go on with.
+        It was refused, failed or was stopped; the message names the file that can be resumed.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What a camera tells of its trigger and its exposure: ready for a trigger, exposing.
+"""Trigger and exposure status of a camera: ready for a trigger, exposing.
 
 A trigger that comes before the camera is armed is ignored (Lucid's `TriggerArmed`; SFNC and Basler: `AcquisitionStatus`
 of `FrameTriggerWait`).

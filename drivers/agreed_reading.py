@@ -5,7 +5,7 @@ from collections.abc import Callable
 from drivers.clock import REAL, Clock
 from drivers.errors import ReplyError
 
-# On a line that changed something this short a time ago, two garbled replies may well be alike.
+# On a line that was disturbed this short a time ago, two garbled replies may be equal.
 _MEMORY_S = 60.0
 _CALM, _DISTURBED = 2, 4
 _TRIES = 6
@@ -30,7 +30,7 @@ class AgreeingReadings:
         Parameters
         ----------
         request : str
-            What is read, for the error.
+            Name of the reading, for the error.
         read, is_moving : callable
             Ask the device.
         tolerance : float

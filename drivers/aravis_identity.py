@@ -12,7 +12,7 @@ from drivers.pixel_formats import ANGLES_LAYOUT, PixelFormat
 def identify(
     config: Config, aravis: Any, camera: Any, features: Features, *, setup: Setup, fmt: PixelFormat, bits: int
 ) -> CameraIdentity:
-    """Ask an open camera who it is; raises CameraLost if it does not answer."""
+    """Read the identity of an open camera; raises CameraLost if it does not answer."""
     with features.asking("describe itself"):
         name, mtu = setup.interface or ("", None)
         address = camera.get_device().get_device_address().get_address().to_string() if setup.is_gige else ""

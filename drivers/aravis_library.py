@@ -125,7 +125,7 @@ def _not_found(name: str, device: str | None, cameras: list[dict[str, str]], det
 
 
 def _control(link: Any, glib_error: Any) -> bool:
-    """Take control, at once or when the camera no longer hears of who had it."""
+    """Take control, at once or when the camera has lost its previous controller."""
     until_s = REAL.now_s() + _FREES_ITSELF_S
     while not link.is_controller() and REAL.now_s() < until_s:
         with contextlib.suppress(glib_error):

@@ -1,4 +1,4 @@
-"""What an axis tells about itself and what a rig file tells about an axis."""
+"""Identity, position and limits of an axis, and its entry in a rig file."""
 
 import math
 from collections.abc import Mapping
@@ -49,7 +49,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class AxisIdentity:
-    """Who answered on the line: kind of driver, model, serial number, firmware, port and address."""
+    """Identity of an axis: kind of driver, model, serial number, firmware, port and address."""
 
     kind: str
     model: str
@@ -67,7 +67,7 @@ def _ascending(ends: tuple[float | None, float | None]) -> tuple[float | None, f
 
 
 def stage_limit(told_deg: float) -> float | None:
-    """A limit as a controller tells it, in degrees; None for a number so large that the stage has none."""
+    """A limit as the controller reports it, in degrees; None for a number so large that the stage has none."""
     return None if abs(told_deg) >= NO_LIMIT_DEG else told_deg
 
 

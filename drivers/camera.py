@@ -1,4 +1,4 @@
-"""A camera that gives whole frames, each of a known exposure, and says what became of the others.
+"""A camera that gives whole frames, each of a known exposure, and counts the lost ones.
 
 A capture is a sequence of triggered exposures. Between two of them nothing is exposed, so a setting that is
 changed there holds for the whole of the next frame. Frames that belong to no exposure asked for are thrown away
@@ -149,7 +149,7 @@ class Exposure:
 
 
 class Camera(ABC):
-    """One camera. Public methods check and count; what a camera family does itself is in the `_do_` hooks.
+    """One camera. Public methods check and count; the `_do_` hooks hold the part of a camera family.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ class Camera(ABC):
 
     @property
     def top_of_counts(self) -> TopOfCounts:
-        """What the frames since the last change of the pixel format have shown of the step and the end of counts."""
+        """Step and end of counts, from the frames since the last change of the pixel format."""
         if self._top is None:
             self._top = TopOfCounts(self.bits, self._converter_bits())
         return self._top
@@ -335,7 +335,7 @@ class Camera(ABC):
         """Temperature of the camera in degrees Celsius; None where it has no sensor."""
 
     def forget_clock(self) -> None:  # noqa: B027 - a camera that compares no clocks has nothing to forget
-        """The host's clock was set: what was learnt from it about the times of frames holds no more."""
+        """Discard the comparison with the camera's clock, because the host's clock was set."""
 
     def close(self) -> None:
         """Stop and release the camera. Closing twice is harmless."""

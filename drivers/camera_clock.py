@@ -1,4 +1,4 @@
-"""When a frame left its camera, told by the camera's own clock.
+"""The time at which a frame left its camera, by the camera's own clock.
 
 The host notes a frame when it gets round to reading it, which on a busy machine may be much later. The camera notes
 it as it exposes. So a frame of an exposure that nobody asked for can look as if it came after the next trigger,

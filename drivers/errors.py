@@ -1,4 +1,4 @@
-"""Everything that can go wrong with a device, each error saying what was asked, what came back, what to do."""
+"""Errors of devices: each has the request, the answer and the advice."""
 
 from functools import partial
 from typing import Any
@@ -10,9 +10,9 @@ class DeviceError(Exception):
     Parameters
     ----------
     asked : str
-        What was asked of which device.
+        The request, with the name of the device.
     came_back : str
-        What the device or the operating system answered.
+        Answer of the device or the operating system.
     what_to_do : str
         The next step for the person at the bench.
     """
@@ -36,7 +36,7 @@ class PortLost(DeviceError):
 
 
 class PortBusy(DeviceError):
-    """Another program holds the port; the holder is named where the system tells it."""
+    """Another program holds the port; the message names it where the system does."""
 
 
 class PermissionRefused(DeviceError):
@@ -81,7 +81,7 @@ class MotionFailed(DeviceError):
     elapsed_s, allowed_s : float
         Time since the start of the motion and the time it was given.
     why : str
-        What was seen: stalled, silent, fault flag, wrong end position.
+        Observation: stalled, silent, fault flag, wrong end position.
     unit : str
         Of target and position; "V" for a liquid crystal.
     """

@@ -25,7 +25,7 @@ _LONGER, _LONGER_S = 1.01, 1e-3
 _SHORTER = 0.8
 # Differences on read-back that are rounding on cameras that state no step: a sensor row, a tenth of a decibel.
 _EXPOSURE_FLOOR_US, _GAIN_FLOOR_DB = 20.0, 0.1
-#: What a capture's gain is set with; the other entries of the selector are set to their neutral value.
+#: Entries of the selector for a capture's gain; the others are set to their neutral value.
 _WHOLE_GAIN = ("All", "AnalogAll")
 
 
@@ -227,7 +227,7 @@ class ExposureAndGain:
         except CameraLost:
             raise
         except CameraError:
-            # What it reads back says where the counts end.
+            # The value read back gives the end of the counts.
             return
 
     def converter_bits(self) -> int | None:

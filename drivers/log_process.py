@@ -1,4 +1,4 @@
-"""A log that a process of its own appends to its file: a disc that hangs or is full holds up nobody."""
+"""A log that another process appends to its file: a disc that hangs or is full does not block the program."""
 
 import contextlib
 import os
@@ -9,7 +9,7 @@ import threading
 import time
 from pathlib import Path
 
-#: What is kept in memory while the disc takes nothing; the oldest goes first.
+#: Text kept in memory while the disc takes nothing; the oldest is dropped first.
 KEPT_BYTES = 1 << 20
 #: Longest wait for the disc when the log is closed.
 CLOSE_S = 1.0
@@ -52,13 +52,13 @@ class LogProcess:
         self.flush()
 
     def flush(self) -> None:
-        """Pass on what is kept, as far as it is taken now."""
+        """Pass on the pending text, as far as the pipe takes it now."""
         with self._lock, contextlib.suppress(OSError):
             if self._process is not None and self._pending:
                 self._pending = self._pending[os.write(self._pipe, self._pending) :]
 
     def close(self) -> None:
-        """Pass on what is kept and end, as far as the disc takes it within CLOSE_S."""
+        """Pass on the pending text and end, as far as the disc takes it within CLOSE_S."""
         process, end_s = self._process, time.monotonic() + CLOSE_S
         if process is None:
             return
@@ -76,7 +76,7 @@ class LogProcess:
 
 
 def _write(path: str) -> None:
-    """Append the standard input to a file that has no other name: a link may lead to a file of somebody else."""
+    """Append the standard input to a file that has no other name: a link may lead to a file of another user."""
     flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
     with open(os.open(path, flags, 0o666), "ab") as file:
         status = os.fstat(file.fileno())

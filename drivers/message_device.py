@@ -93,7 +93,7 @@ class MessageDevice:
             raise self._loss(error) from error
 
     def drop_input(self) -> None:
-        """Throw away what waits; an instrument on USBTMC keeps an answer until it is asked for."""
+        """Discard pending input; an instrument on USBTMC keeps an answer until it is read."""
         self._buffer.clear()
         while not self._is_usbtmc and select.select([self._file], [], [], 0)[0]:
             if not self._receive(0):

@@ -1,4 +1,4 @@
-"""The Micro-Manager core of this process, as pymmcore-plus holds it: one core, whoever made it.
+"""The Micro-Manager core of this process, as pymmcore-plus holds it: one core for all users.
 
 A program that has a core already (a notebook, a viewer) shares it with the drivers; for a command of its own, such as
 `acquire`, the rig file names the configuration that is loaded first. What goes wrong in a device is an exception, whose

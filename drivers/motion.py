@@ -186,7 +186,7 @@ class MotionAxis(ABC):
         self._closed = False
         self._start_lock = threading.Lock()
         self._readings = AgreeingReadings(clock)
-        # Set by the driver's open(), from what the controller reports.
+        # Set by the driver's open(), from the controller's report.
         self.counts_per_deg: float = 1.0
         self.speed_deg_s: float = math.nan
         self.acceleration_deg_s2: float = math.nan
@@ -280,7 +280,7 @@ class MotionAxis(ABC):
         return self._identity
 
     def _identify(self, *, model: str, serial_number: str, firmware: str, address: str) -> None:
-        """Note what a driver's open() has read, for `describe`."""
+        """Store the identity that a driver's open() has read, for `describe`."""
         kind: str = self.config.kind  # type: ignore[attr-defined]  # of every section of a rig file
         self._identity = AxisIdentity(kind, model, serial_number, firmware, self.config.port, address)
 

@@ -1,9 +1,9 @@
-"""Settings that somebody may have left on a camera, and the value at which each of them does nothing.
+"""Settings that another program may have left on a camera, and the value at which each of them does nothing.
 
 A GenICam description does not tell what a setting does or where it is neutral. The rules here go by the names of the
 GenICam Standard Features Naming Convention (SFNC 2.7) and by those that makers have in public feature lists (84 lists
 of the EPICS ADGenICam module: Allied Vision, Basler, FLIR, Point Grey, Adimec, Mikrotron, Teledyne, Tucsen, ViewWorks).
-A rule is a pattern, so a name that is not in those lists is found where it is formed alike.
+A rule is a pattern, so it also matches similar names that are not in those lists.
 """
 
 import re
@@ -199,7 +199,7 @@ class NeutralFeatures:
         self.remarks += [text for text, _ in issues if text not in reported]
 
     def _load(self) -> Iterator[str]:
-        """Load the default user set; yields what is left unknown."""
+        """Load the default user set; yields a remark on features that stay unknown."""
         if self._user_set is None:
             yield from self._remark_unknown("no user set is loaded (`user_set: null`)")
             return
@@ -326,5 +326,5 @@ class NeutralFeatures:
                     yield f"{name} is {now} and could not be set to {neutral}", rule
 
     def _is_switched_off(self, name: str) -> bool:
-        """True where a flag of its own says that a number is not used."""
+        """True where a flag says that a number is not used."""
         return any(self._value(name + end) in (False, "Off") for end in ("Enable", "Enabled"))

@@ -37,7 +37,7 @@ class PromptLine:
         self._echo = echo
 
     def ask(self, query: str, form: re.Pattern[str] | None = None) -> str:
-        """One query; an unusable reply, also one of another form, is asked for once more after a pause.
+        """One query; after an unusable reply, also one of another form, it is repeated once after a pause.
 
         Raises
         ------

@@ -191,7 +191,7 @@ def agreed(read: Callable[[], T]) -> T:
     Raises
     ------
     ReplyError
-        Four readings and no two in a row alike.
+        Four readings and no two in a row equal.
     """
     readings = [read()]
     while len(readings) < 4:
@@ -244,7 +244,7 @@ class ControllerLine:
 
 
 class Line(Protocol):
-    """What a driver keeps for each port: something that can be closed."""
+    """The object that a driver keeps for each port; it can be closed."""
 
     def close(self) -> None:
         """Close the port."""
@@ -254,14 +254,14 @@ L = TypeVar("L", bound=Line)
 
 
 class LineRegistry:
-    """One owner for each port, shared by all axes on that line; closes what is left when it is closed.
+    """One owner for each port, shared by all axes on that line; closes the remaining ports when it is closed.
 
     Parameters
     ----------
     transcript_folder : Path, optional
         Folder that gets one transcript of the wire for each port.
     clock : Clock
-        What every driver on these lines counts its deadlines and pauses by.
+        Of the deadlines and pauses of every driver on these lines.
     """
 
     def __init__(self, transcript_folder: Path | None = None, clock: Clock = REAL) -> None:
@@ -327,7 +327,7 @@ class LineRegistry:
     def descriptors(self) -> dict[str, int]:
         """Descriptors of the open device files, by path; of a network port there is none."""
         with self._lock:
-            # What several axes share is an object of its own around the link.
+            # Several axes share an object around the link.
             links = {key: getattr(line, "link", line) for key, (line, _) in self._lines.items() if "://" not in key}
         return {key: link.fileno() for key, link in links.items() if hasattr(link, "fileno")}
 

@@ -1,4 +1,4 @@
-"""Serial ports: opening one, who has it open, and ports that another process hands over."""
+"""Serial ports: opening one, programs that have it open, and ports that another process hands over."""
 
 import contextlib
 import errno
@@ -62,7 +62,7 @@ class HeldPort:
         termios.tcflush(self._file, termios.TCIFLUSH)
 
     def close(self) -> None:
-        """Nothing: whoever received the descriptor closes it."""
+        """Do nothing: the receiver of the descriptor closes it."""
 
 
 #: Start of the address of a port that was handed over.

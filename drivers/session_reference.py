@@ -19,7 +19,7 @@ class SessionReferenceAxis(MotionAxis):
     """Homed after `home()` in this session, or because the rig file says so.
 
     The reference is given up when the resting axis shows another position than the one it was left at: the
-    controller was reset, or somebody turned it.
+    controller was reset, or it was turned by hand.
     """
 
     def __init__(self, name: str, config: SessionReferenceConfig, clock: Clock = REAL) -> None:

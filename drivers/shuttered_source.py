@@ -1,4 +1,4 @@
-"""A light source that may have an SC10 shutter beside it: filter wheels and tunable filters."""
+"""A light source that may have an SC10 shutter: filter wheels and tunable filters."""
 
 import contextlib
 from collections.abc import Callable
@@ -19,7 +19,7 @@ class ShutteredConfig(SourceConfig):
 
 
 class ShutteredSource(PortSource):
-    """What the shutter does for the source, where there is one."""
+    """Light on and off by the shutter, where there is one."""
 
     _shutter: LightSource | None
 
@@ -28,7 +28,7 @@ class ShutteredSource(PortSource):
         return self._shutter is not None and self._shutter.interlock_open()
 
     def describe(self) -> dict[str, str]:
-        """Kind, model and port, what the driver adds, and the model of the shutter."""
+        """Kind, model and port, the driver's own facts, and the model of the shutter."""
         description = super().describe() | self._facts()
         return description if self._shutter is None else description | {"shutter": self._shutter.describe()["model"]}
 

@@ -90,7 +90,7 @@ class LightSource(ABC):
         Raises
         ------
         DeviceError
-            The source has no such wavelength, or cannot choose at all.
+            The source has no such wavelength, or no choice of wavelengths.
         """
         raise DeviceError(
             f"light source, select {wavelength_nm:g} nm",
@@ -123,7 +123,7 @@ class SourceConfig(BaseModel):
 
 
 class PortSource(LightSource):
-    """A source behind a port of its own; its driver sets what stands here."""
+    """A source behind a port; its driver sets these attributes."""
 
     config: SourceConfig
     _model: str

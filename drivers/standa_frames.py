@@ -7,7 +7,7 @@ nothing.
 
 import struct
 
-# Longer than any command: what the controller still waits for is filled up, and refused by its checksum.
+# Longer than any command: it completes a partial command, which the controller refuses by its checksum.
 RESYNCHRONIZE = bytes(250)
 UNKNOWN_COMMAND, WRONG_CHECKSUM, WRONG_VALUE = b"errc", b"errd", b"errv"
 

@@ -1,4 +1,4 @@
-"""A port whose controller takes lines of text and answers in lines, without saying what they answer."""
+"""A port whose controller takes and answers lines of text, without naming the question in the answer."""
 
 import re
 from typing import ClassVar

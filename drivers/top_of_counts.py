@@ -17,7 +17,7 @@ _LEVELS, _SAMPLE = 64, 20_000
 
 
 class TopOfCounts:
-    """What the frames of one pixel format have shown so far.
+    """Step and end of counts in the frames of one pixel format so far.
 
     Parameters
     ----------

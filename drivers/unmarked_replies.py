@@ -1,4 +1,4 @@
-"""Questions over lines whose replies do not tell which question they answer: order and form alone tell it."""
+"""Questions over lines whose replies do not name the question: only order and form identify it."""
 
 import re
 from collections.abc import Callable
@@ -20,12 +20,12 @@ def ask(
     what_to_check: str,
     tries: int = 2,
 ) -> T:
-    """Ask a question and return what is read from the first reply to it; again if none came.
+    """Ask a question and return the value of the first reply to it; again if none came.
 
     Parameters
     ----------
     question : bytes to write.
-    read : gets each frame and returns what it says, or None if it is no reply to this question.
+    read : gets each frame and returns its value, or None if it is no reply to this question.
     reply_s : longest wait, for each of the tries.
     request, what_to_check : for the messages.
 

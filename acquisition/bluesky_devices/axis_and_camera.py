@@ -62,7 +62,7 @@ class CameraDevice(BlueskyDevice):
     Attributes
     ----------
     exposure_s : of the next frames; a plan sets it by `Bench.exposure`, or by `configure`.
-    sample : what an emulated rig shows.
+    sample : sample that an emulated rig shows.
     folder : where frames are put, each in a file of its own that documents point to, as Tiled and everybody else who
         takes no images in events wants it; None: the events hold the frames.
     tells_frames : False for the mean alone.

@@ -24,7 +24,7 @@ from acquisition.stop_request import StopRequest
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import COLUMN_UNITS, position_column
 
-#: Columns of the file that tell of each state, beside the angles.
+#: Columns of the file with a value for each state, in addition to the angles.
 COLUMNS = ("exposure_s", "host_time_s", "monitor", "saturated_fraction")
 
 
@@ -67,7 +67,7 @@ class CaptureDevice(BlueskyDevice):
         self._documents: list[tuple[str, dict[str, Any]]] = []
 
     def trigger(self) -> MoveStatus:
-        """Take the capture, or what is missing of one that a pause has interrupted."""
+        """Take the capture, or the states that are missing after a pause."""
         self._stop = StopRequest()
         self._taking = in_background(self._take)
         return self._taking
@@ -140,7 +140,7 @@ class CaptureDevice(BlueskyDevice):
         try:
             return run(job, self.rig, path, self._stop, home=self._home)
         except BaseException:
-            # What is there already is gone on with, should the plan be run again.
+            # An existing partial file is resumed when the plan runs again.
             partial = path if path.name.endswith(PARTIAL) else path.with_name(path.name + PARTIAL)
             self._half = partial if partial.exists() else None
             raise
@@ -152,10 +152,10 @@ class CaptureDevice(BlueskyDevice):
             self._taking.exception(timeout=None)
 
     def resume(self) -> None:
-        """Nothing: the RunEngine triggers again, and the capture is gone on with then."""
+        """Do nothing: the RunEngine triggers again, which resumes the capture."""
 
     def stop(self, *, success: bool = False) -> None:
-        """End after the state that is being taken; the file can be gone on with by `acquire --resume`."""
+        """End after the state that is being taken; `acquire --resume` continues the file."""
         self._stop.request()
 
     def _column(self, axis: str) -> tuple[str, str]:

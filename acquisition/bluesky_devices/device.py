@@ -47,5 +47,5 @@ def readings(values: dict[str, Any]) -> Readings:
 
 
 def data_key(source: str, shape: tuple[int, ...], units: str) -> dict[str, Any]:
-    """What `describe` says of one value: a number, or an array of a shape."""
+    """The entry of `describe` for one value: a number, or an array of a shape."""
     return {"source": source, "dtype": "array" if shape else "number", "shape": list(shape), "units": units}

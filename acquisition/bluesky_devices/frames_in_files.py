@@ -24,7 +24,7 @@ def write_frame(folder: Path, name: str, frame: NDArray[np.uint16], exposure_s: 
     for number in itertools.count(1):
         path = folder / f"{stem}-{number:03d}.h5"
         try:
-            # Refuses a name that is taken, also where somebody else takes it at this moment.
+            # Refuses an existing name, also one that another program creates at this moment.
             h5 = h5py.File(path, "x")
         except FileExistsError:
             continue

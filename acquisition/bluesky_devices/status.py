@@ -1,11 +1,11 @@
-"""What a RunEngine waits for, and work in a thread that ends it."""
+"""Statuses that a RunEngine waits for, and work in a thread that completes one."""
 
 import threading
 from collections.abc import Callable
 
 
 class MoveStatus:
-    """What the RunEngine waits for: done, with or without an error."""
+    """A status that the RunEngine waits for: done, with or without an error."""
 
     def __init__(self) -> None:
         self._ended = threading.Event()
@@ -38,7 +38,7 @@ class MoveStatus:
         callback(self)
 
     def end(self, error: BaseException | None = None) -> None:
-        """Tell everybody who waits."""
+        """Notify all waiting threads and callbacks."""
         with self._lock:
             self._error = error
             self._ended.set()
@@ -47,7 +47,7 @@ class MoveStatus:
 
 
 def in_background(work: Callable[[], None]) -> MoveStatus:
-    """Do something in a thread of its own; its error becomes the status's."""
+    """Run a function in a new thread; its error becomes that of the status."""
     status = MoveStatus()
 
     def run() -> None:

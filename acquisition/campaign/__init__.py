@@ -1,1 +1,1 @@
-"""Campaigns: many captures as one value, run unattended and gone on with after an interruption."""
+"""Campaigns: many captures as one value, run unattended and resumed after an interruption."""

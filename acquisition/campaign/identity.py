@@ -1,4 +1,4 @@
-"""What a campaign is taken with: the same rig, plans, instruments, devices and program in each of its runs."""
+"""Identity of a campaign: each of its runs has the same rig, plans, instruments, devices and program."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -16,20 +16,20 @@ from processing.doors import read_json
 from processing.errors import ProcessError
 
 IDENTITY = "identity.json"
-#: What it holds by name, several of each.
+#: Parts of the identity that are stored by name.
 KINDS = ("rig", "plan", "instrument")
-#: Differences that are told one by one.
+#: Differences that are listed one by one.
 SHOWN = 20
 
 
 def campaign_identity(
     campaign: Campaign, jobs: Sequence[tuple[CampaignCapture, Job]], config: RigConfig, rig_file: Path
 ) -> dict[str, Any]:
-    """What a campaign is taken with, as plain values; the devices come with `with_devices`.
+    """The identity of a campaign as plain values; `with_devices` adds the devices.
 
     Parameters
     ----------
-    rig_file : where the rig's file is, to be named to whoever forgets it.
+    rig_file : path of the rig file, for the message about a changed set-up.
     """
     modes = {capture.plan.mode: job.instrument for capture, job in jobs}
     facts = {
@@ -52,7 +52,7 @@ def with_devices(identity: dict[str, Any], rig: Rig) -> dict[str, Any]:
 
 
 def require_same_campaign(folder: Path, now: dict[str, Any]) -> None:
-    """Refuse to go on with a campaign that was begun with something else.
+    """Refuse to continue a campaign that was begun with another set-up.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def _changes(then: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
         if key not in then and key == "device":
             continue
         if key in KINDS:
-            # The same of several modes and captures is said once.
+            # A difference that several modes or captures share is listed once.
             for name in now[key]:
                 yield from differences(then.get(key, {}).get(name), now[key][name], key)
         elif key != "rig_file":
@@ -83,7 +83,7 @@ def _changes(then: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
 
 
 def read_identity(folder: Path) -> dict[str, Any] | None:
-    """What the campaign in a folder was begun with; None if it has not begun. Raises ProcessError."""
+    """Identity with which the campaign in a folder was begun; None if it has not begun. Raises ProcessError."""
     path = folder / IDENTITY
     if not path.exists():
         return None

@@ -1,4 +1,4 @@
-"""What a campaign leaves behind besides captures: a log in JSON lines, and an index of what was taken."""
+"""Log (JSON lines) and index of the captures of a campaign."""
 
 import datetime
 import json
@@ -56,7 +56,7 @@ class CampaignFolder:
         if not plan.exists():
             self._write_whole(plan, text)
         elif read_text(plan, ConfigError) != text:
-            # What is no campaign any more says so itself.
+            # A folder that is no longer a campaign raises its own error.
             load_yaml(plan, Campaign)
             raise AcquisitionError(
                 f"{self.folder} holds another campaign: {plan} differs from the file given. "
@@ -64,7 +64,7 @@ class CampaignFolder:
             )
 
     def begin_with(self, identity: Mapping[str, Any]) -> None:
-        """Note what the campaign is taken with, once."""
+        """Write the identity of the campaign, once."""
         if not (self.folder / IDENTITY).exists():
             self._write_whole(self.folder / IDENTITY, json.dumps(identity, indent=1))
 
@@ -160,7 +160,7 @@ def read_index(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def entry_of(capture: CampaignCapture, path: Path) -> dict[str, Any]:
-    """What the index says of a capture whose file is there. Raises CaptureError."""
+    """The index entry of a capture file. Raises CaptureError."""
     plan = capture.plan
     with Capture(path) as file:
         saturated = float(np.max(file.column("saturated_fraction"), initial=0.0))

@@ -1,4 +1,4 @@
-"""Runs a campaign: everything checked before the first motion, each capture gone on with where it stopped."""
+"""Runs a campaign: checks everything before the first motion, and resumes a capture where it stopped."""
 
 import time
 from collections.abc import Sequence
@@ -93,11 +93,11 @@ def _trace(error: Exception) -> dict[str, str]:
 
 
 class CampaignRun:
-    """Takes what is missing of a campaign, capture by capture.
+    """Takes the missing captures of a campaign, one by one.
 
     Parameters
     ----------
-    folder : open; log and index go there beside the captures.
+    folder : open; it holds log and index next to the captures.
     """
 
     def __init__(
@@ -246,7 +246,7 @@ class CampaignRun:
 
     @property
     def rig(self) -> Rig | None:
-        """The rig that is open now, for those who watch a simulated one."""
+        """The rig that is open now, for observers of a simulated one."""
         return self._rig
 
     def _open_rig(self) -> Rig:

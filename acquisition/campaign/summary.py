@@ -1,4 +1,4 @@
-"""What a night has brought, in a few lines: for the folder, the console and whoever is told."""
+"""Summary of a campaign in a few lines, for the folder, the console and the notification."""
 
 import json
 from collections import Counter
@@ -18,12 +18,12 @@ SATURATED = 0.001
 
 
 def summary_lines(folder: Path, names: Sequence[str], index: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """What became of each capture, since when, and what is worth looking at.
+    """Status of the captures, first and last event, and problems to look at.
 
     Parameters
     ----------
     names : of all captures of the campaign, in order.
-    index : what there is of them.
+    index : entry of each capture that has one.
     """
     status = {name: str(index.get(name, {}).get("status", "not begun")) for name in names}
     counts = Counter(status.values())
@@ -66,6 +66,6 @@ def _events(folder: Path) -> list[dict[str, Any]]:
             if isinstance(event, dict) and "time" in event:
                 events.append(event)
     except (ProcessError, ValueError):
-        # A line that was cut off by a full disc: what came before it is told.
+        # A line that was cut off by a full disc: the lines before it are reported.
         pass
     return events

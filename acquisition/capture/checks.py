@@ -37,7 +37,7 @@ class CheckResult:
 
 
 def refuse_failed(checks: Sequence[CheckResult]) -> None:
-    """Raise PlanRefused with every check that failed; nothing has moved by then."""
+    """Raise PlanRefused with every check that failed, before anything has moved."""
     failures = [f"{check.title}: {check.detail}" for check in checks if not check.passed]
     if failures:
         raise PlanRefused(failures)
@@ -67,7 +67,7 @@ def standing_pose_deg(plan: MeasurementPlan, rig: RigConfig) -> dict[str, float]
 
 
 def check_plan(plan: MeasurementPlan, rig: RigConfig) -> list[CheckResult]:
-    """What the files alone tell: mode, wavelength, axes, exposure, forbidden poses."""
+    """Checks that need only the files: mode, wavelength, axes, exposure, forbidden poses."""
     checks = [_member("mode", plan.mode, list(rig.modes))]
     wavelengths = [f"{w:g}" for w in rig.wavelengths_nm]
     checks.append(_member("wavelength_nm", f"{plan.wavelength_nm:g}", wavelengths))

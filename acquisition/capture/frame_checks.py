@@ -1,4 +1,4 @@
-"""What a frame says of itself, and against the camera, the lamp and the shutter, as it comes."""
+"""Checks of each frame as it arrives: its own consistency, camera, lamp and shutter."""
 
 from collections.abc import Callable
 
@@ -106,7 +106,7 @@ class FrameChecks:
         )
 
     def look(self, report: StateReport, frame: Frame, planned_s: float, pose: tuple[float, ...]) -> None:
-        """Hold a frame that is kept against the others.
+        """Compare an accepted frame with the others.
 
         Parameters
         ----------
@@ -150,6 +150,6 @@ class FrameChecks:
             )
 
     def judge(self) -> None:
-        """Report what the frames of the run together say against the camera."""
+        """Report evidence against the camera from all frames of the run."""
         for finding in self.evidence.judge():
             self._warn(f"false frame: {finding.text}")

@@ -1,4 +1,4 @@
-"""A file name for a new capture that nobody else gets, should several begin in the same second."""
+"""A unique file name for a new capture, also if several programs begin in the same second."""
 
 import itertools
 import os
@@ -14,7 +14,7 @@ from acquisition.errors import AcquisitionError
 
 @contextmanager
 def free_name(path: Path) -> Iterator[Path]:
-    """The path, or NAME-2.h5, NAME-3.h5 ... where that is taken; it is nobody else's until the end of the block.
+    """The path, or NAME-2.h5, NAME-3.h5 ... if that exists; reserved until the end of the block.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a capture says about itself before its first state: header, title, file name."""
+"""Header, title and file name of a capture, which are known before its first state."""
 
 import datetime
 import json

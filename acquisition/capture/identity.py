@@ -1,4 +1,4 @@
-"""What a capture is made with, and in which way two runs that should belong together differ.
+"""Identity of a capture's set-up, and the differences between two runs that should belong together.
 
 Plan, rig, instrument, devices and program are the same in all parts of a capture. What may differ is where a device is
 plugged in, and how far its counters are.
@@ -24,7 +24,7 @@ from processing.storage.captures.capture import Capture
 from processing.storage.captures.segments import Identity
 from processing.yaml_file import named_files, parse_yaml
 
-#: Keys of a rig file that tell where something is or who hears of it, not what it is.
+#: Keys of a rig file with a location or a recipient, which are not part of the identity.
 PLACES = ("port", "device", "wire_log", "alert", "notify", "held_by")
 #: Properties of a device that stay.
 LASTING = (
@@ -35,7 +35,7 @@ PASSING = ("exposure_s", "frame_average", "packet_size", "trigger")
 
 
 def identity_of(plan: MeasurementPlan, config: RigConfig, instrument: InstrumentModel, rig: Rig | None) -> Identity:
-    """Digests of what a run is made with; without `rig`, what the files alone tell."""
+    """Digests of the set-up of a run; without `rig`, of the files alone."""
     return Identity(
         simulated=config.simulated,
         plan=digest(plain(plan)),
@@ -97,7 +97,7 @@ def digest(tree: Any) -> str:
 
 
 def require_same(capture: Capture, plan: MeasurementPlan, config: RigConfig, instrument: InstrumentModel) -> None:
-    """Refuse to go on with a capture that was begun with something else, as far as files tell.
+    """Refuse to continue a capture whose files differ from those that it was begun with.
 
     Raises
     ------

@@ -66,7 +66,7 @@ def prepare(plan: MeasurementPlan, rig: RigConfig, read: ReadInstrument = Instru
     """Check a plan against a rig file; touches no device.
 
     Where the plan leaves the exposure to be found, the table holds the one that the search starts with. `read` reads
-    the instrument's file; whoever prepares many plans reads it once.
+    the instrument's file; a caller that prepares many plans reads it once.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def job_of(path: Path, rig: RigConfig | None = None, plan: MeasurementPlan | Non
     Parameters
     ----------
     rig : the rig to go on with instead of the one stored in the file; only where its devices are plugged in may differ.
-    plan : what the capture should be of; None for what its file says.
+    plan : the plan of the capture; None for the one in its file.
 
     Raises
     ------

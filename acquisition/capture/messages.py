@@ -1,4 +1,4 @@
-"""What a run says in words, for its closing record."""
+"""Messages of a run, for its closing record."""
 
 import time
 from dataclasses import dataclass, field
@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Messages:
-    """What the capture's closing record tells besides numbers; the oldest are kept."""
+    """Messages for the closing record; the first 200 are kept."""
 
     texts: list[str] = field(default_factory=list)
     dropped: int = 0

@@ -55,7 +55,7 @@ class Operator:
         return changes
 
     def confirm(self, question: str) -> bool:
-        """Ask for what a source without a cable needs; True once it is done. Raises as `prepare`."""
+        """Ask the operator to switch a source without a cable; True once it is done. Raises as `prepare`."""
         return self._answer(question, f"{question} Press Enter for yes, n for no.") != "n"
 
     def _ask(self, change: str) -> None:

@@ -61,7 +61,7 @@ class FixedPose(FiniteSection):
     states: int = Field(default=8, gt=0, le=10_000, description="number of frames in the one pose")
 
     def angles_deg(self, named: NamedStates) -> dict[str, NDArray[np.float64]]:
-        """No axis of its own."""
+        """This mode turns no axis."""
         return {}
 
 

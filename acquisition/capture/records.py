@@ -1,4 +1,4 @@
-"""What a run writes about itself: the begin and the end of its segment."""
+"""Records of a run: the begin and the end of its segment."""
 
 import getpass
 import os
@@ -15,7 +15,7 @@ from acquisition.rig.rig import Rig
 
 
 def begin_record(job: Job, rig: Rig, number: int) -> dict[str, Any]:
-    """Who takes states from now on, when, and with what."""
+    """The begin record: program, time and set-up of a segment."""
     return {
         "event": "begin",
         "segment": number,

@@ -14,7 +14,7 @@ from processing.computing.filters import block_means
 #: part of the brightest are left out.
 BLOCKS, BLOCK_PIXELS = 16, 8
 LIT = 0.2
-#: Changes that are told: of all the light, and from block to block (standard deviation).
+#: Changes that are reported: of all the light, and from block to block (standard deviation).
 CHANGED = 0.01
 PATTERN = 0.02
 
@@ -32,7 +32,7 @@ class RepeatedState:
         self._first: tuple[float, ...] | None = None
         self._state = 0
         self._blocks = np.zeros(0)
-        # A plan of one pose repeats it with every state: the first change is told, not each.
+        # A plan of one pose repeats it with every state: only the first change is reported.
         self._is_reported = False
 
     def look(self, state: int, exposure_s: float, pose: tuple[float, ...], frame: NDArray[np.generic]) -> str | None:

@@ -66,7 +66,7 @@ class CaptureRunner:
     table : rows of the capture.
     writer : open partial file.
     detector : for the black level and full scale of the statistics.
-    observers : told of everything; the simulated bench is one of them.
+    observers : receive every event; the simulated bench is one of them.
     saturation_limit : fraction of saturated pixels from which a state raises TooBright; None never.
     mosaic : True for a polarization sensor.
     lit_darks : comparison of darks and lights that has seen the states of earlier runs; None for a new one.
@@ -150,7 +150,7 @@ class CaptureRunner:
         return not self._pending
 
     def tell(self, text: str) -> None:
-        """Tell the observers what the rig does now."""
+        """Report the present activity of the rig to the observers."""
         for observer in self.observers:
             observer.activity(text)
 
@@ -174,7 +174,7 @@ class CaptureRunner:
         losses = -1
         with self.ledger.time("probing"):
             while losses != self.rig.light_losses():
-                # What was seen while the light was shut from outside does not count.
+                # Frames exposed while the light was shut from outside do not count.
                 losses = self.rig.light_losses()
                 found_s = find_exposure(
                     self.rig,
@@ -190,7 +190,7 @@ class CaptureRunner:
         self._scale_exposure(found_s / auto.start_s)
 
     def start_darker(self, why: str) -> None:
-        """Forget the states taken and go on with a shorter exposure."""
+        """Discard the states taken and continue with a shorter exposure."""
         self.warn(f"{why}; beginning again at {DARKER:g} of the exposure")
         self.writer.forget()
         self.checks.evidence.forget()
@@ -341,13 +341,13 @@ class CaptureRunner:
     # --- what can be wrong with it -----------------------------------------------------------------------
 
     def _light_was_lost(self) -> bool:
-        """Tell of a light that was shut from outside since it was last switched."""
+        """Report a light that was shut from outside since it was last switched."""
         for text in self.rig.guard_news():
             self.warn(text)
         return self.rig.light_losses() != self._light_losses
 
     def _clock_jumped(self) -> bool:
-        """Tell of a clock that was set or a machine that slept since the last look."""
+        """Report a clock that was set, or a machine that slept, since the last look."""
         jump = self._wall_clock.look()
         if jump is None:
             return False
@@ -356,7 +356,7 @@ class CaptureRunner:
         return True
 
     def _require_rested(self, state: int, motions: Mapping[str, Motion]) -> None:
-        """Refuse to go on with an axis that has moved, or lost its count, since the state before. Raises RunFailed."""
+        """Stop at an axis that has moved, or lost its count, since the state before. Raises RunFailed."""
         for axis, motion in motions.items():
             before, start = self._rested.get(axis), motion.start
             if before is None or start is None:

@@ -1,4 +1,4 @@
-"""One capture from job to sealed file: home, go to the pose, take the states, seal, whatever happens."""
+"""One capture from job to sealed file: home, go to the pose, take the states, and seal, also after an error."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -49,7 +49,7 @@ def take(
     Raises
     ------
     AcquisitionError, DeviceError
-        The run failed; the message names the partial file, which `resume` goes on with.
+        The run failed; the message names the partial file, which `resume` continues.
     """
     _require_reference(rig, home)
     place_sample(job, rig)
@@ -71,7 +71,7 @@ def take(
 def resume(
     job: Job, rig: Rig, partial: Path, stop: StopRequest, *, observers: Sequence[Observer] = (), home: bool = False
 ) -> Result:
-    """Go on with a capture: the first state not done, then the others, as a new segment of it. Raises as `take`.
+    """Continue a capture: the first state not done, then the others, as a new segment of it. Raises as `take`.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def resume(
 
 @dataclass(frozen=True)
 class Earlier:
-    """What a capture that is resumed brings along: its states, number of segments, the light in them, its darks."""
+    """State of a capture that is resumed: its states, number of segments, the light in them, its darks."""
 
     done: set[int]
     segments: int
@@ -254,7 +254,7 @@ def _go_to_start(job: Job, rig: Rig, runner: CaptureRunner, first: int) -> None:
         runner.tell(f"homing {', '.join(unhomed)}")
         with runner.ledger.time("homing"):
             rig.home(unhomed)
-    # The arm goes first and alone: what stands on it and the sample are what it can hit.
+    # The arm goes first and alone: the parts on it and the sample can collide.
     runner.go(first, "approach")
 
 
@@ -273,7 +273,7 @@ def _shut(rig: Rig) -> Callable[[], None]:
 
 
 def _begin_segment(job: Job, rig: Rig, runner: CaptureRunner, earlier: Earlier) -> None:
-    """Say in the file who takes states of it from now on, and with what."""
+    """Write the begin record of the new segment into the file."""
     writer = runner.writer
     runner.interlocks.remember(earlier.light)
     writer.segment = earlier.segments

@@ -31,7 +31,7 @@ KILLED_S = 2.0
 LINE_BYTES = 10
 #: An image is written in pieces of so many bytes: the disc works on one while the next is copied.
 PIECE = 1 << 20
-#: What a damaged file makes HDF5 and the look-ups in it raise.
+#: Errors that HDF5 and the look-ups raise for a damaged file.
 UNREADABLE = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError)
 
 
@@ -82,7 +82,7 @@ class StateFile:
             ) from error
 
     def _lock(self) -> None:
-        """Take the lock that HDF5 takes as well, so that nobody opens the file while it is written."""
+        """Take the lock that HDF5 takes as well, so that no program opens the file while it is written."""
         try:
             lock(self._file)
         except OSError as error:
@@ -168,7 +168,7 @@ class StateFile:
             raise AcquisitionError(
                 f"{self.path} was resumed so often that its journal is full. Start it again with --as-new."
             )
-        # What a line that was cut off has left goes with it.
+        # The rest of a line that was cut off is removed with it.
         self._write_text(self._segments, end, encode_line(raw))
 
     def segment_records(self) -> list[dict[str, Any]]:
@@ -187,7 +187,7 @@ class StateFile:
         self.write_column("done", np.zeros(self.states))
 
     def require_at(self, path: Path) -> None:
-        """Raise AcquisitionError if the file is not of that name any more: what is written then is lost with it."""
+        """Raise AcquisitionError if the file no longer has that name: all data written to it would be lost."""
         with contextlib.suppress(OSError):
             if os.path.samestat(os.fstat(self._file), os.stat(path)):
                 return
@@ -247,7 +247,7 @@ class StateFile:
         for start in range(0, len(raw), PIECE):
             piece = raw[start : start + PIECE]
             write_whole(self._file, offset + start, piece)
-            # Pages that are not needed are written at once, and nobody waits for it. Some file systems do not know it.
+            # Pages that are not needed are written at once, without waiting. Some file systems do not support it.
             with contextlib.suppress(OSError):
                 os.posix_fadvise(self._file, offset + start, len(piece), os.POSIX_FADV_DONTNEED)
 

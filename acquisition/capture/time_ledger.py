@@ -1,4 +1,4 @@
-"""Where the time of a capture went: moving, settling, exposing, waiting for what is unavoidable, or overhead."""
+"""Time budget of a capture: moving, settling, exposing, unavoidable waits, and overhead."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,7 +19,7 @@ Entry = Literal[
     "shutter",
     "interlock",
 ]
-#: What happens before the states, or because of somebody at the door.
+#: Entries before the states, or because of an open interlock.
 BESIDES = ("homing", "approach", "probing", "interlock")
 
 
@@ -27,12 +27,12 @@ class TimeLedger:
     """Adds up, in seconds of the measuring thread, what each kind of step took.
 
     `moving` is the time the thread waited for axes (parallel moves count once), so what overlaps a move costs
-    nothing here. `overhead` is what no entry explains.
+    nothing here. `overhead` is the time that no entry explains.
 
     Parameters
     ----------
     clock : drivers.clock.Clock
-        What the rig's own waits are counted by.
+        Clock of the rig's own waits.
     """
 
     def __init__(self, clock: Clock = REAL) -> None:

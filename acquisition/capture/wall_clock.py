@@ -1,7 +1,7 @@
 """Notices that the machine's clock was set, or that the machine slept, while a capture runs.
 
-Deadlines count on clocks that nobody can set. The time of day is only for the record, and there it goes on from the
-start of the run, as if nobody had set the clock: the order and the distances in time of the states stay right.
+Deadlines count on clocks that cannot be set. The time of day is only for the record, and there it continues from the
+start of the run, as if the clock had not been set: the order and the distances in time of the states stay right.
 """
 
 import time

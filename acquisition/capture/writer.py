@@ -87,13 +87,13 @@ class CaptureWriter:
     Attributes
     ----------
     on_failure : called from another thread with what `put` would raise.
-    on_blocked : called from a thread of its own, once each time the disc has taken nothing for DARK_S.
+    on_blocked : called from another thread, once each time the disc has taken nothing for DARK_S.
     segment : number of the segment that the states written now belong to.
 
     Parameters
     ----------
     path : of the partial file.
-    clock : what the patience with the disc is counted by.
+    clock : measures how long the disc takes.
     """
 
     def __init__(self, path: Path, clock: Clock = REAL) -> None:
@@ -154,7 +154,7 @@ class CaptureWriter:
 
     def _on_written(self, state: Future[None]) -> None:
         error = state.exception()
-        # A state that has failed already is told of by `put` itself: a future swallows what this raises.
+        # `put` itself reports a state that has failed already: a future swallows an error raised here.
         if error is not None and self.on_failure is not None and threading.get_ident() != self._thread_id:
             self.on_failure(self._failure(error))
 

@@ -1,4 +1,4 @@
-"""`acquire --campaign FILE`: check the whole of it, then run what is missing."""
+"""`acquire --campaign FILE`: check all captures, then run the missing ones."""
 
 import contextlib
 import os
@@ -96,7 +96,7 @@ def _rig_of(campaign: Campaign, file: Path) -> Path | None:
     Raises
     ------
     ConfigError
-        It is in a folder of captures, which may be somebody else's.
+        It is in a folder of captures, which may belong to another user.
     """
     if campaign.rig is None or not (file.parent / IDENTITY).exists() or is_own_rig(campaign.rig):
         return campaign.rig
@@ -118,7 +118,7 @@ def _refuse_with_campaign(options: Options, file: Path) -> None:
 
 
 def _sum_up(held: CampaignFolder, names: Sequence[str]) -> list[str]:
-    """Write the summary into the folder, whatever the run came to, if the disc takes it."""
+    """Write the summary into the folder after every run, also a failed one, if the disc takes it."""
     try:
         return on_disc("write the summary", _write_summary, held.folder, names, held.index)
     except AcquisitionError as error:

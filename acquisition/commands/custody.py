@@ -1,4 +1,4 @@
-"""`acquire verify`, `repair` and `compress`: what a folder of captures holds, what is damaged and what half done."""
+"""`acquire verify`, `repair` and `compress`: complete, damaged and incomplete captures of a folder."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +16,7 @@ from processing.yaml_file import load_yaml
 
 
 def verify(folder: Path) -> Iterator[Finding]:
-    """Read every frame of every capture in a folder, and name what is left over; changes nothing.
+    """Read every frame of every capture in a folder, and list stray files; changes nothing.
 
     A finding is not well where something is damaged or contradicts the index, None where something is unfinished.
     """
@@ -87,7 +87,7 @@ def _index(folder: Path) -> Iterator[Finding]:
 
 
 def repair(folder: Path) -> Iterator[Finding]:
-    """Finish what was left half done: seal whole captures, remove strays, make the index of a campaign from its files.
+    """Finish interrupted work: seal whole captures, remove strays, make the index of a campaign from its files.
 
     No state is removed. A damaged one is marked as not taken, and its capture is partial again; a file that is no
     capture any more is named and left as it is.
@@ -114,7 +114,7 @@ def repair(folder: Path) -> Iterator[Finding]:
 
 
 def compressed(folder: Path) -> Iterator[Finding]:
-    """Compress each complete capture of a folder; what is not complete, and what is damaged, stays as it is."""
+    """Compress each complete capture of a folder; incomplete and damaged ones stay as they are."""
     for path in sorted(folder.glob("*.h5")):
         if mark_of(path, "umov_schema") is None:
             continue

@@ -1,4 +1,4 @@
-"""What the commands of `acquire` share: files that come with the program, the rig option, the exit code of a stop."""
+"""Shared by the commands of `acquire`: files that come with the program, the rig option, the exit code of a stop."""
 
 from pathlib import Path
 from typing import Annotated

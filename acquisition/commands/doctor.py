@@ -1,4 +1,4 @@
-"""`acquire doctor`: what is there, what is not and why. Moves nothing, changes no light."""
+"""`acquire doctor`: which devices are present, and why others are not. Moves nothing, changes no light."""
 
 import importlib
 import shutil
@@ -108,7 +108,7 @@ def _instrument(path: Path) -> str:
 
 
 def describe_axis(axis: MotionAxis) -> str:
-    """An axis in a line: who it is, where it stands, its limits, speed and warnings. Raises DeviceError."""
+    """An axis in a line: identity, position, limits, speed and warnings. Raises DeviceError."""
     identity = axis.describe()
     limits = axis.limits
     ends = "limits " + " to ".join("none" if end is None else f"{end:g}" for end in (limits.min_deg, limits.max_deg))
@@ -129,7 +129,7 @@ def describe_axis(axis: MotionAxis) -> str:
 
 
 def describe_source(rig: Rig) -> str:
-    """The light source in a line; light that nobody switched on is an error."""
+    """The light source in a line; a light that is already on is an error."""
     source = rig.open_source()
     state = "light on" if source.is_on() else "light off"
     facts = source.describe()
@@ -144,7 +144,7 @@ def describe_source(rig: Rig) -> str:
 def _camera(camera: Camera, config: RigConfig, frames: int) -> str:
     """Take frames and count those that were lost; the dark ones of a shut source serve as well."""
     exposure_s = max(EXPOSURE_S, config.exposure_s[0])
-    # By software, whatever triggers a capture: nobody fires a hardware trigger for this.
+    # By software, also if captures use a hardware trigger: nothing fires one here.
     camera.configure(CameraSettings(exposure_s=exposure_s, frame_average=1, trigger="software"))
     identity = camera.describe()
     lost = 0

@@ -14,7 +14,7 @@ from processing.errors import ProcessError
 from processing.whole_file import write_new_text
 from processing.yaml_file import parse_yaml
 
-#: What is known to carry these USB numbers (vendor, product); a plain FTDI chip (0403:6001) may be anything.
+#: Kinds with these USB numbers (vendor, product); a plain FTDI chip (0403:6001) may be anything.
 LIKELY = {
     (0x0403, 0xFAF0): "apt",
     (0x0403, 0x6015): "elliptec",
@@ -26,7 +26,7 @@ BY_ID = Path("/dev/serial/by-id")
 
 @dataclass(frozen=True)
 class FoundPort:
-    """A serial port: a path that stays when cables are moved, what it says of itself, and what it probably is."""
+    """A serial port: a path that stays when cables are moved, its description, and its probable kind."""
 
     path: str
     description: str
@@ -178,7 +178,7 @@ def _camera(cameras: Sequence[dict[str, str]], why_none: str) -> list[str]:
 
 
 def write_rig(path: Path, configuration: Path | None = None) -> str:
-    """Look for devices, also in a configuration of Micro-Manager, write the file, tell what was found.
+    """Look for devices, also in a configuration of Micro-Manager, write the file, report the devices.
 
     Raises
     ------

@@ -71,7 +71,7 @@ class Options:
 
 
 def run(options: Options, stop: StopRequest) -> int:
-    """Take or go on with one capture; returns the exit code. Raises the errors that `main` prints."""
+    """Take or continue one capture; returns the exit code. Raises the errors that `main` prints."""
     with disc_process():
         return _run(options, stop)
 
@@ -116,7 +116,7 @@ def _run(options: Options, stop: StopRequest) -> int:
 
 
 def _job(options: Options) -> tuple[Job, Path, bool]:
-    """The job, its file or the name that a new one would like, and whether the file is gone on with."""
+    """The job, its file or the preferred name of a new one, and whether the file is resumed."""
     if options.resume is None:
         job = prepare(plan_of(options), rig_of(options))
         return job, options.out / default_name(job.plan), False
@@ -139,7 +139,7 @@ def own_rig_of(capture: Capture, exactly: bool) -> RigConfig:
     Raises
     ------
     ConfigError
-        There is none. The rig in the capture is not used: its commands and paths may be somebody else's.
+        There is none. The rig in the capture is not used: its commands and paths may be those of another user.
     """
     stored, mode = stored_rig(capture), capture.header.mode
     equal = []
@@ -173,7 +173,7 @@ def _seal_if_whole(path: Path) -> Path | None:
 
 
 def _refuse_with_resume(options: Options) -> None:
-    """A capture that is gone on with has its plan in its file."""
+    """A capture that is resumed has its plan in its file."""
     flags = options.given("omega", "mode", "wavelength", "sample", "exposure", "plan", "seed")
     if flags:
         raise ConfigError(

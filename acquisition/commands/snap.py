@@ -47,7 +47,7 @@ def take_frame(
         rig.show(sample, wavelength_nm)
         before = rig.source.is_on() if rig.source is not None else None
         camera = rig.require_camera()
-        # By software, whatever triggers a capture: nobody fires a hardware trigger for this.
+        # By software, also if captures use a hardware trigger: nothing fires one here.
         settings = camera.configure(CameraSettings(exposure_s=exposure_s, frame_average=1, trigger="software"))
         try:
             if rig.source is not None:

@@ -108,7 +108,7 @@ def block_rms(residual: Residual) -> NDArray[np.float64]:
 
 
 def _causes(part: SubFigure, demo: Demo) -> None:
-    """True faults and what was found for each, then the figures before and after."""
+    """True faults and the effect found for each, then the figures before and after."""
     axis = part.subplots()
     axis.set_axis_off()
     lines: list[tuple[tuple[str, ...], str]] = []

@@ -26,14 +26,14 @@ from processing.yaml_file import ConfigError, dump_yaml
 from simulators.bench.scene import Scene
 from simulators.bench.typical_faults import FAULTS
 
-#: Called with a step's command line as a user would type it, or with what the diagnosis does now.
+#: Called with a step's command line as a user would type it, or with the present step of the diagnosis.
 Say = Callable[[str], None]
 SAMPLE = "red_sphere"
 
 
 @dataclass(frozen=True)
 class Demo:
-    """What a run of the demo has found, and what is true.
+    """Result of a run of the demo, and the truth.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The result of the demo in words: built-in faults with what was found, and the figures before and after."""
+"""The result of the demo in words: built-in faults with the effects found, and the figures before and after."""
 
 from acquisition.demo.loop import Demo
 from processing.diagnosis.search.result import FoundEffect

@@ -1,4 +1,4 @@
-"""What the simulated rig truly has: drawn faults, and the Mueller image and xi0 that a product is compared with."""
+"""Truth of the simulated rig: drawn faults, and the Mueller image and xi0 that a product is compared with."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

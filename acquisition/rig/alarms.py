@@ -1,4 +1,4 @@
-"""Alarms that repeat until somebody acknowledges them; each is a small file in memory, so that any program sees it."""
+"""Alarms that repeat until they are acknowledged; each is a small file in memory, so that any program sees it."""
 
 import contextlib
 import datetime
@@ -15,7 +15,7 @@ ACKNOWLEDGE = "acquire acknowledge"
 
 @dataclass(frozen=True)
 class Alarm:
-    """An alarm that nobody has acknowledged yet."""
+    """An alarm that is not acknowledged yet."""
 
     path: Path
     rig: str
@@ -67,7 +67,7 @@ def keep(title: str, name: str, text: str) -> str:
 
 
 def unacknowledged() -> list[Alarm]:
-    """The alarms that nobody has acknowledged, the oldest first."""
+    """The alarms that are not acknowledged, the oldest first."""
     pending = []
     for path in folder().glob("alarm-*.json") if _is_own(folder()) else ():
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
@@ -77,5 +77,5 @@ def unacknowledged() -> list[Alarm]:
 
 
 def acknowledge(alarm: Alarm) -> None:
-    """Somebody has seen it: the guard that repeats it notes so and ends."""
+    """Acknowledge an alarm: the guard that repeats it records this and ends."""
     alarm.path.unlink(missing_ok=True)

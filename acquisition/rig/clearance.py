@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from acquisition.rig.solids import Box, Cylinder, Solid, Solids
 
-#: What is nearer than the margin and this counts as too near, so that the search ends.
+#: Added to the margin, so that the search ends.
 RESOLUTION_MM = 0.5
 
 Ranges = Mapping[str, tuple[float, float]]

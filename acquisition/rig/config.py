@@ -1,4 +1,4 @@
-"""The rig file: which devices, at which ports, which poses are forbidden, what the simulator stands in for."""
+"""The rig file: devices and ports, forbidden poses, and devices that the simulator replaces."""
 
 import contextlib
 from collections.abc import Mapping
@@ -31,7 +31,7 @@ class RigConfig(RigSections):
     @model_validator(mode="wrap")
     @classmethod
     def _report_all_mistakes(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
-        # What one section says about another is looked at even where a section cannot be read at all.
+        # References between sections are checked even if a section cannot be read.
         mistakes: list[Mistake] = []
         rig: RigConfig
         try:
@@ -83,7 +83,7 @@ def _readable(data: dict[str, Any]) -> RigConfig:
         try:
             sections["axes"][name] = TypeAdapter(AxisEntry).validate_python(entry)
         except ValidationError:
-            # Its name is known all the same.
+            # Its name is known nevertheless.
             sections["axes"][name] = None
     return RigConfig.model_construct(**sections)
 

@@ -52,7 +52,7 @@ def describe(box: ForbiddenPose) -> str:
 
 
 def _meet(way: tuple[float, float], edges: tuple[float, float]) -> bool:
-    """Whether a way has an angle in common with a range, whatever the turn."""
+    """Whether a way has an angle in common with a range, in any turn."""
     if not way[1] - way[0] < TURN_DEG:
         return True
     low, high = _nearest_copy(edges, way[0])

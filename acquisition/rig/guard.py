@@ -52,12 +52,12 @@ HEARTBEAT_S = 60.0
 LONGEST_S = 86_400.0
 #: Most ports that `acquire` hands over.
 MOST_PORTS = 64
-#: What the guard says of axes that obey.
+#: Report of axes that obey.
 AT_REST = "axes at rest"
 
 
 class Guard:
-    """Watches one `acquire` and acts in its place.
+    """Watches one `acquire` and makes the rig safe if it fails.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class Guard:
     def __init__(self, config: RigConfig, pid: int, journal: Journal, file_rig: RigConfig | None = None) -> None:
         self.config, self.pid, self.journal = config, pid, journal
         self.file_rig = file_rig or config
-        # Nobody waits for them; they are kept because a handle that is dropped complains.
+        # They are not waited for; the handles are stored because Python warns about a dropped one.
         self.alerts: list[subprocess.Popen[bytes]] = []
         self._cutoff_lines = LineRegistry()
         self._cutoff: LightSource | None = None
@@ -260,7 +260,7 @@ class Guard:
 
 
 class GuardAlarm:
-    """An alarm at the console and by the rig's command, again and again until somebody acknowledges it."""
+    """An alarm at the console and by the rig's command, repeated until it is acknowledged."""
 
     def __init__(self, guard: Guard, text: str) -> None:
         self._guard = guard
@@ -341,7 +341,7 @@ def with_held_ports(config: RigConfig, held: dict[str, int]) -> RigConfig:
 
 
 def main() -> None:
-    """Guard what the first line of the socket says."""
+    """Guard the rig that the first line of the socket describes."""
     # Ctrl-C at the terminal is for acquire, which ends in order; the guard outlives it.
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)

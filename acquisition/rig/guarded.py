@@ -18,7 +18,7 @@ from acquisition.rig.guard import LATE_S, LOOK_S, SILENT_KILL_S, SILENT_SHUT_S, 
 from drivers.source import LightSource
 from processing.yaml_file import dump_yaml
 
-#: The guard's journal beside the captures.
+#: The guard's journal, next to the captures.
 GUARD_LOG = "guard.jsonl"
 #: Time between two beats.
 BEAT_S = 0.1
@@ -43,7 +43,7 @@ class Guarding:
     Parameters
     ----------
     ports : descriptors of the rig's open ports, by real path.
-    shut : shuts the light; raises what the device raises.
+    shut : shuts the light; raises DeviceError.
     tell : hears of every loss at once, from another thread.
 
     Attributes
@@ -84,7 +84,7 @@ class Guarding:
             raise RunFailed("the light could not be shut when the guard was lost. Look at the source and its cable.")
 
     def say_failed(self, text: str) -> None:
-        """Have somebody called by the rig's alert command."""
+        """Run the rig's alert command."""
         if self._watching.wait(END_S):
             self._say({"failed": text.replace("\n", " ")})
 
@@ -229,7 +229,7 @@ class Guarding:
         return None
 
     def _receive(self, wait_s: float) -> list[dict[str, object]] | None:
-        """What the guard said in this time; None where it has ended."""
+        """Messages of the guard in this time; None if it has ended."""
         assert self._line is not None
         if not select.select([self._line], [], [], wait_s)[0]:
             return []

@@ -16,7 +16,7 @@ Pose = tuple[float, ...]
 
 #: How often an open interlock is looked at.
 LOOK_S = 0.05
-#: What an interlock's reason starts with where it can close by itself.
+#: Start of the reason of an interlock that can close by itself.
 WAITABLE = ("the door", "the camera")
 
 
@@ -49,7 +49,7 @@ class Interlocks:
 
     Parameters
     ----------
-    warn : told when one opens and closes.
+    warn : called when one opens and closes.
     go_on : True if the plan lets the run go on by itself when it closes again.
 
     What the lamp and the drift are held against is the light of the capture's first states, in whichever run they were

@@ -22,7 +22,7 @@ class JointAxes:
     Attributes
     ----------
     axes : dict of name to MotionAxis
-    clock : what every wait and deadline is counted by.
+    clock : of every wait and deadline.
     """
 
     def __init__(self, config: RigConfig, clock: Clock) -> None:
@@ -82,7 +82,7 @@ class JointAxes:
         """
         way = find_way(self.config, self.known_pose(), targets_deg, by, limits=self.limits, first=first)
         if way is None:
-            # Says what is met.
+            # It raises and names the obstacle.
             self._check_way(targets_deg)
         for targets in way or []:
             self.move(targets)
@@ -133,7 +133,7 @@ class JointAxes:
 
     def known_pose(self) -> dict[str, float]:
         """Angles of the axes that forbidden poses and solids speak of, as far as they are known."""
-        # Where an axis without a reference stands is not known, whatever it reads.
+        # The position of an axis without a reference is unknown, even if it gives a reading.
         axes = {name: self.axes[name] for name in restricted_axes(self.config) if name in self.axes}
         return {name: axis.read_position().deg for name, axis in axes.items() if axis.is_homed()}
 
@@ -178,7 +178,7 @@ class JointAxes:
         return {name: positions[name] for name in motions}
 
     def rest(self) -> None:
-        """Wait until no axis moves, for moves that nobody waits for any more."""
+        """Wait until no axis moves, after moves that were not waited for."""
         for axis in self.axes.values():
             end_s = self.clock.now_s() + REST_WITHIN_S
             while axis.is_moving():
@@ -195,5 +195,5 @@ class JointAxes:
         return min(max(off_s / 2, SHORTEST_LOOK_S), longest_s)
 
     def stop(self) -> Exception | None:
-        """Stop every axis, whatever they answer; the first failure."""
+        """Stop every axis, also after a failure; returns the first failure."""
         return run_all([(f"stop axis {name}", axis.stop) for name, axis in self.axes.items()])

@@ -1,4 +1,4 @@
-"""The journal of the guard: lines of JSON that a process of its own writes."""
+"""The journal of the guard: lines of JSON, written by another process."""
 
 import datetime
 import json
@@ -21,5 +21,5 @@ class Journal:
         self._log.add(json.dumps({"time": when, "event": event} | details) + "\n")
 
     def close(self) -> None:
-        """Have what was noted written, as far as the disc takes it."""
+        """Write the pending notes, as far as the disc takes them."""
         self._log.close()

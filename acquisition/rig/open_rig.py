@@ -101,7 +101,7 @@ class EmulatedRig(Rig):
         return super().open_camera()
 
     def _resolve_port(self, entry: Any) -> Any:
-        # What is switched by hand has no port.
+        # A device that is switched by hand has no port.
         if not getattr(entry, "port", "").startswith(SCHEME):
             return entry
         changes = {"port": self.simulation.port(entry.port.removeprefix(SCHEME))}

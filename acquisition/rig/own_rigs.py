@@ -1,6 +1,6 @@
 """The rig files and campaigns that this user has given to a command, as a list in the home folder.
 
-A data file may come from somebody else. Devices, commands and paths are taken from these rig files, never from it.
+A data file may come from another user. Devices, commands and paths are taken from these rig files, never from it.
 """
 
 import contextlib
@@ -42,7 +42,7 @@ def is_own_rig(file: Path) -> bool:
 
 
 def own_campaign(folder: Path) -> tuple[Path, Path] | None:
-    """Campaign file and rig file with which the user began the campaign in a folder; None for somebody else's."""
+    """Campaign file and rig file with which the user began the campaign in a folder; None for that of another user."""
     files = _entries("campaigns").get(str(folder.resolve()))
     if isinstance(files, list) and len(files) == 2 and all(isinstance(file, str) for file in files):
         return Path(files[0]), Path(files[1])

@@ -55,7 +55,7 @@ class Rig(JointAxes):
     camera : Camera or None where it was not asked for
     source : LightSource or None where the rig has none
     clock : Clock
-        What every wait and deadline is counted by.
+        Of every wait and deadline.
     last_frame : ndarray or None
         Pixels of the last frame of a capture, which a frozen camera gives again in the next one.
 
@@ -124,7 +124,7 @@ class Rig(JointAxes):
             self.open_camera()
 
     def start(self) -> str:
-        """Start what the devices need before they are opened; says what was started."""
+        """Start the services that the devices need before they are opened; returns their description."""
         return self.config.name
 
     def show(
@@ -205,7 +205,7 @@ class Rig(JointAxes):
             )
 
     def _guard_says(self, text: str) -> None:
-        # At once: before the first state, and in a long exposure, nobody asks for the news.
+        # At once: before the first state, and in a long exposure, the messages are not read.
         log.warning("%s", text)
         self._guard_news.append(text)
 
@@ -232,7 +232,7 @@ class Rig(JointAxes):
         self._guard_says(why)
 
     def guard_news(self) -> list[str]:
-        """What the guard's watch has had to say since the last call."""
+        """Messages of the guard's watch since the last call."""
         return [self._guard_news.popleft() for _ in range(len(self._guard_news))]
 
     def call_for_help(self, error: Exception) -> None:
@@ -299,7 +299,7 @@ class Rig(JointAxes):
         try:
             shut.start()
         except RuntimeError:
-            # No thread to be had: one after the other, then.
+            # No thread is available: one after the other.
             shut.run()
         failure = super().stop()
         self._was_stopped = True

@@ -19,11 +19,11 @@ from simulators.rig.model import SCHEME
 if TYPE_CHECKING:
     from acquisition.rig.sections import RigSections
 
-#: What the name of a port on the network begins with.
+#: Prefix of the name of a port on the network.
 SOCKET = "socket://"
 #: An interlock on a higher temperature of a camera could not be meant.
 HOTTEST_C = 150.0
-#: Keys that lead to the place in the file, and what is wrong there.
+#: Keys that lead to the place in the file, and the mistake there.
 Mistake = tuple[tuple[int | str, ...], str]
 
 
@@ -81,7 +81,7 @@ def _axis_names(rig: RigSections) -> Iterator[Mistake]:
 
 
 def _names_in_captures(rig: RigSections) -> Iterator[Mistake]:
-    """An axis is a group of its own in a capture file."""
+    """Each axis is a group in a capture file."""
     for name in rig.axes:
         if not NAME.fullmatch(name):
             yield ("axes", name), f"{name!r} is no name for an axis: letters, digits and _, and begin with a letter"

@@ -1,4 +1,4 @@
-"""What is in the way of a move or of homing, and which way is free: forbidden poses, and solids that come too near."""
+"""Obstacles of a move or of homing, and free ways: forbidden poses, and solids that come too near."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def find_obstacle(
     *,
     limits: Mapping[str, Limits] | None = None,
 ) -> str | None:
-    """What a move meets anywhere on its way, in words; None if the way is free.
+    """The first obstacle on the way of a move, in words; None if the way is free.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def restricted_axes(rig: RigSections) -> set[str]:
 
 
 def find_homing_obstacle(rig: RigSections, names: Iterable[str], here_deg: Mapping[str, float]) -> str | None:
-    """What axes homed one after another could meet, in words; None if their way is free.
+    """The first obstacle of axes that are homed one after another, in words; None if their way is free.
 
     Parameters
     ----------

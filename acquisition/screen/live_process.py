@@ -28,13 +28,13 @@ from processing.reports.design import style
 Frame = NDArray[np.uint16]
 Drawn = TypeVar("Drawn")
 
-#: Browsers answered at the same time; others are told to come again.
+#: Browsers answered at the same time; others get a request to try again.
 CLIENTS = 8
 #: Connections whose request is not there yet; fewer than a process may have open.
 WAITING = 256
 #: Connections that the system takes before we do.
 BACKLOG = 1024
-#: Largest request without what is sent along, bytes.
+#: Largest request without its body, bytes.
 LONGEST_HEAD = 1 << 14
 #: A browser that is silent, or does not read, for so long is given up.
 PATIENCE_S = 3.0
@@ -66,7 +66,7 @@ class Shown:
                     self._modulation.add(frame)
 
     def snapshot(self) -> dict[str, Any]:
-        """What the page asks for twice a second, ready for JSON."""
+        """The state that the page requests twice a second, ready for JSON."""
         with self._lock:
             view = dict(self._view)
             frame = self._frame
@@ -137,7 +137,7 @@ class Page:
             finally:
                 self._waiting.pop(writer, None)
             await asyncio.wait_for(self._answer(head.decode("latin-1"), writer), PATIENCE_S)
-            # What is sent along is not kept; closed at once, the browser would not read the answer.
+            # The body is discarded; if closed at once, the browser would not read the answer.
             writer.write_eof()
             async with asyncio.timeout(PATIENCE_S):
                 while await reader.read(LONGEST_HEAD):
@@ -171,7 +171,7 @@ class Page:
                 self._clients -= 1
 
     def _refusal(self, method: str, headers: dict[str, str], token: str) -> bytes | None:
-        """What is said to anyone without the token or from a page of another site."""
+        """The answer to a request without the token, or from a page of another site."""
         host = headers.get("host", "")
         # Another site that resolves its name to this machine sends its own name as host.
         if host.rsplit(":", 1)[0] not in ("127.0.0.1", "localhost"):
@@ -207,7 +207,7 @@ async def _send(writer: asyncio.StreamWriter, code: int, kind: str, body: bytes,
 
 
 def take_updates(link: socket.socket, memory: int, shown: Shown) -> None:
-    """Take what the measuring program sends until it has ended."""
+    """Receive updates of the measuring program until it has ended."""
     while data := link.recv(LARGEST):
         message = json.loads(data)
         frame = None
@@ -226,7 +226,7 @@ def _frame(memory: int, shape: list[int]) -> Frame:
 
 
 def run_only_when_idle() -> None:
-    """Leave the processor to whoever wants it; where the system has no such class, be as nice as can be."""
+    """Run at the lowest priority: the idle class, or the highest niceness where the system has no such class."""
     os.nice(19)
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))

@@ -1,4 +1,4 @@
-"""The live page of a run, served by a process of its own: what the measuring program does for it.
+"""The live page of a run, served by another process: the part in the measuring program.
 
 The measuring thread hands over what it has and never waits: a few kilobytes of state into a socket that drops what does
 not fit, and the last frame into memory that both processes see, if the page is done with the frame before. Everything

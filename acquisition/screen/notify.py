@@ -1,4 +1,4 @@
-"""Tells somebody how a run ended, that it failed, or that an interlock holds it: by a command, a webhook, or both."""
+"""Notifications of the end of a run, a failure, or an open interlock: by a command, a webhook, or both."""
 
 import json
 import logging
@@ -90,14 +90,14 @@ class Notifier(Observer):
             log.warning("notify: %s cannot be reached (%s)", config.webhook, error)
 
     def settle(self) -> None:
-        """Wait until what was sent has arrived, but not for long."""
+        """Wait a short time until the messages are sent."""
         for thread in self._sending:
             thread.join(PATIENCE_S)
 
 
 @contextmanager
 def notifying(config: NotifyConfig | None, subject: Path, simulated: bool) -> Iterator[Notifier]:
-    """A notifier around a run: an error of the run is told as a failure, and raised all the same."""
+    """A notifier around a run: an error of the run is sent as a failure, and raised again."""
     notifier = Notifier(config, subject, simulated)
     try:
         yield notifier

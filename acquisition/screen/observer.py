@@ -1,4 +1,4 @@
-"""Who watches a run: progress bar, live page, campaign log, and the simulated bench."""
+"""Observers of a run: progress bar, live page, campaign log, and the simulated bench."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +15,7 @@ Mosaic = tuple[tuple[str, ...], ...]
 
 @dataclass(frozen=True)
 class StateReport:
-    """What was seen in one state that is on its way to the file."""
+    """Report of one state whose frames are being written."""
 
     state: int
     role: str
@@ -37,7 +37,7 @@ class Observer:
         """A capture begins with so many states to take; `mosaic` lays out the analyzers of a polarization camera."""
 
     def activity(self, text: str) -> None:
-        """What the rig does now, in a few words."""
+        """The present activity of the rig, in a few words."""
 
     def exposing(self, state: int, retake: int) -> None:
         """The next exposure belongs to this state; `retake` counts its tries from 0."""

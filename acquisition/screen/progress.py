@@ -1,4 +1,4 @@
-"""What the console shows while a capture runs: state, angles, time left; plain lines where it is no terminal."""
+"""Console output while a capture runs: state, angles, time left; plain lines where it is no terminal."""
 
 import time
 from typing import Any
@@ -28,7 +28,7 @@ class ConsoleProgress(Observer):
         self._start_s = self._line_s = time.monotonic()
         self._warned: set[str] = set()
         self._campaign_s: float | None = None
-        # Captures of a campaign; none is told of outside one.
+        # Captures of a campaign; 0 outside one.
         self._first = self._current = self._captures = 0
 
     def campaign_progress(self, number: int, total: int, name: str) -> None:

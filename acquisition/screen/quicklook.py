@@ -18,7 +18,7 @@ HARDLY = 0.01
 
 
 def draw(path: Path) -> Path:
-    """Draw mean image, modulation and mean of each state of a capture; returns the PNG beside it.
+    """Draw mean image, modulation and mean of each state of a capture; returns the PNG next to it.
 
     Modulation is (max - min) / (max + min) over the light states, without the dark; in a mosaic over the super-pixel.
     """

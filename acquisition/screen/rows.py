@@ -27,6 +27,6 @@ def print_rows(rows: Iterable[Sequence[str]], console: Console | None = None) ->
     table = Table(box=None, show_header=False, pad_edge=False)
     for row in rows:
         style = "bold red" if row[0] in ("BAD", "REFUSED") else ""
-        # Folded where it is too long: of a path that is cut short nobody can tell what is wrong.
+        # Folded where it is too long: a truncated path would not show the mistake.
         table.add_row(*(Text(shown(cell), style, overflow="fold") for cell in row))
     console.print(table)

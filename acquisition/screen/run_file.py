@@ -1,4 +1,4 @@
-"""What a run says of itself to other programs of this machine: one small file beside its captures, while it runs.
+"""State of a run for other programs of this machine: one small file next to its captures, while it runs.
 
 Who looks from elsewhere sees where the run is, and may send its process what Ctrl-C sends. A thread of its own writes
 the file a few times a second: a slow or full disc keeps nobody from measuring.
@@ -133,7 +133,7 @@ def start_ticks(pid: int) -> int | None:
 
 
 def running_in(folder: Path) -> dict[str, Any] | None:
-    """What the program that takes captures in a folder says; None where none does."""
+    """The state of the program that takes captures in a folder; None if there is none."""
     return next((facts for path in sorted(folder.glob(PATTERN)) if (facts := _read(path)) is not None), None)
 
 

@@ -64,7 +64,7 @@ class ElliptecLine(ControllerLine):
 
     def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
         super().__init__(config, clock, transcript, line_framer, baudrate=9600, reply_s=0.6)
-        # Last message of each module that nobody had asked for: the end of its move.
+        # Last unsolicited message of each module: the end of its move.
         self.ended: dict[str, tuple[str, str]] = {}
         self._unanswered_stops: Counter[str] = Counter()
         self._last_sent_s = -float("inf")
@@ -100,7 +100,7 @@ class ElliptecLine(ControllerLine):
         return answers
 
     def _note(self, address: str, letters: str, data: str) -> None:
-        """Keep what a module says unasked: the end of its move, or an error that ended it."""
+        """Store an unsolicited message of a module: the end of its move, or an error that ended it."""
         if self._answers_a_stop(address, letters):
             return
         if (letters == "PO" and len(data) == 8) or (
@@ -194,7 +194,7 @@ class ElliptecAxis(SessionReferenceAxis):
                     if config.address is not None:
                         raise
             matches = [item for item in modules.items() if config.serial_number in (None, item[1][2:10])]
-            # An answer can be late: while the module is missing, all are asked again.
+            # An answer can be late: all addresses are queried again while the module is missing.
             if matches:
                 break
         request = f"axis {self.name}, find Elliptec module on {config.port}"

@@ -84,7 +84,7 @@ class ESP301Line(ControllerLine):
     def take_errors(self, axis: int) -> list[int]:
         """Empty the controller's error memory and return what concerns an axis, oldest first.
 
-        Errors of other axes are kept for them. An error without an axis belongs to who asks: it is of the last command.
+        Errors of other axes are stored for them. An error without an axis is of the last command, of the caller.
         """
         with self.link.lock:
             for _ in range(20):

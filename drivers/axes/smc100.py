@@ -113,7 +113,7 @@ class SMC100Line(ControllerLine):
 
         question = f"{address}{command}\r\n".encode("ascii")
         request = f"SMC100 {self.link.port} address {address}, {command}"
-        # Who sets a time asks again by itself.
+        # A caller that sets a time repeats the question itself.
         tries = 2 if reply_s is None else 1
         advice = "Check power, cable, baud rate, address"
         return ask(

@@ -224,7 +224,7 @@ class StandaAxis(SessionReferenceAxis):
             self.clock.sleep_s(self.config.poll_s)
 
     def _do_stop(self) -> None:
-        # Brakes: after a stop on the spot a stepper stands elsewhere than it counts. The answer waits for nobody.
+        # Brakes: an abrupt stop of a stepper loses counts. Its reply is not waited for.
         self._line.link.write(message(b"sstp"))
 
     def _do_check_fault(self) -> None:

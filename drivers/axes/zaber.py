@@ -234,7 +234,7 @@ class ZaberAxis(MotionAxis):
     def _find(self) -> tuple[int, str]:
         """Return address and serial number of the device that the rig file means."""
         config = self.config
-        # An answer can be late: the chain is as long as it was the last time, and silence is asked once more.
+        # An answer can be late: two readings of the chain have to agree, and silence is queried once more.
         ask = partial(self._line.ask_all, "get system.serial")
         devices = agreed(ask) or agreed(ask)
         listing = ", ".join(f"address {address}: serial {serial}" for address, serial in devices)

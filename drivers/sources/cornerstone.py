@@ -99,6 +99,6 @@ class Monochromator(PortSource):
 
 
 def open(config: Config, lines: LineRegistry) -> Monochromator:
-    """Open the monochromator; asks who it is and changes nothing."""
+    """Open the monochromator; reads its identity and changes nothing."""
     with lines.link(config, config.baudrate, line_framer) as link:
         return Monochromator(config, link, lines)

@@ -143,9 +143,9 @@ class Dc2200(PortSource):
             raise CommandRejected(request, f"error {code}", "The manual lists the errors")
 
     def _ask(self, query: str, form: re.Pattern[str]) -> str:
-        """One query; without an answer of its form it is asked once more.
+        """One query; without an answer of its form it is repeated once.
 
-        An error is read once and would be lost with a garbled answer; what was set is read back as well.
+        An error is read once and would be lost with a garbled answer; the settings are read back as well.
         """
         answers: list[str] = []
         with self._device.lock:
@@ -167,7 +167,7 @@ class Dc2200(PortSource):
 
 
 def open(config: Config, lines: LineRegistry) -> Dc2200:
-    """Open the LED driver; asks who it is and changes nothing."""
+    """Open the LED driver; reads its identity and changes nothing."""
     with lines.taken(
         config.port, MessageDevice, lambda _: MessageDevice(config.port, lines.clock, config.held_by)
     ) as device:

@@ -54,7 +54,7 @@ class Config(SourceConfig):
 
     @model_validator(mode="after")
     def _one_led_for_each_wavelength(self) -> Self:
-        # Without `channels` the box tells its wavelengths later.
+        # Without `channels` the wavelengths are read from the box later.
         check_wavelengths(self.channels, "channel", self.percent if self.channels else ())
         return self
 
@@ -218,7 +218,7 @@ class Dc4100(PortSource):
         return float(agreed(lambda: self._ask(query, _NUMBER)))
 
     def _ask(self, query: str, form: re.Pattern[str] = _LINE) -> str:
-        """One query; without a reply of the form it is asked once more, after the line has been quiet."""
+        """One query; without a reply of the form it is repeated once, after the line has been quiet."""
         return ask(
             self._link,
             query.encode("ascii") + b"\r\n",
@@ -239,6 +239,6 @@ class Dc4100(PortSource):
 
 
 def open(config: Config, lines: LineRegistry) -> Dc4100:
-    """Open the LED driver; asks who it is and what it drives, and changes nothing."""
+    """Open the LED driver; reads its identity and its LEDs, and changes nothing."""
     with lines.link(config, BAUDRATE, line_framer) as link:
         return Dc4100(config, link, lines)

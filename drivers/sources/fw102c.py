@@ -117,5 +117,5 @@ class FilterWheel(ShutteredSource):
 
 
 def open(config: Config, lines: LineRegistry) -> FilterWheel:
-    """Open the wheel, and the shutter where there is one; asks who they are and changes nothing."""
+    """Open the wheel, and the shutter where there is one; reads their identity and changes nothing."""
     return open_with_shutter(FilterWheel, config, lines, BAUDRATE)

@@ -72,7 +72,7 @@ class RelayModule(PortSource):
             raise self._reply_error("read the outputs", reply) from None
 
     def _ask(self, lead: str, command: str, *, addressed: bool = True) -> str:
-        """What a reply ``!AA...`` holds; an unusable reply is asked for once more."""
+        """The data of a reply ``!AA...``; after an unusable reply the question is repeated once."""
         start = f"!{self.config.address:02X}" if addressed else "!"
         for last in (False, True):
             try:
@@ -100,6 +100,6 @@ class RelayModule(PortSource):
 
 
 def open(config: Config, lines: LineRegistry) -> RelayModule:
-    """Open the module; asks who it is and changes nothing."""
+    """Open the module; reads its identity and changes nothing."""
     with lines.link(config, BAUDRATE, line_framer) as link:
         return RelayModule(config, link, lines)

@@ -24,7 +24,7 @@ BAUDRATE = 115200
 BLACK = 1
 BANDS = {"wide": 2, "medium": 4, "narrow": 8}
 READY, MANUAL = 2, 1
-# A filter shows what it was told to three digits.
+# A filter reports its setting to three digits.
 _SAME_NM = 0.01
 _NUMBER = r"-?\d+(?:\.\d+)?"
 
@@ -113,5 +113,5 @@ class TunableFilter(ShutteredSource):
 
 
 def open(config: Config, lines: LineRegistry) -> TunableFilter:
-    """Open the filter, and the shutter where there is one; asks who they are and changes nothing."""
+    """Open the filter, and the shutter where there is one; reads their identity and changes nothing."""
     return open_with_shutter(TunableFilter, config, lines, BAUDRATE)

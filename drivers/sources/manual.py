@@ -27,7 +27,7 @@ class ManualSource(LightSource):
     Attributes
     ----------
     ask : callable or None
-        Shows a question and returns True for yes; None where nobody can be asked.
+        Shows a question and returns True for yes; None without an operator.
     yes : bool
         True takes every answer as yes without asking (`--yes`).
     """
@@ -39,7 +39,7 @@ class ManualSource(LightSource):
         self.ask = ask
         self.yes = yes
         self._wavelength_nm: float | None = None
-        # Nobody has said yet whether it is on; lamps are, as a rule.
+        # Its state is unknown yet; lamps usually are on.
         self._on = True
 
     def select(self, wavelength_nm: float) -> None:
@@ -62,7 +62,7 @@ class ManualSource(LightSource):
             self._on = on
 
     def is_on(self) -> bool:
-        """What the operator confirmed last; True before any question."""
+        """The state that the operator confirmed last; True before any question."""
         return self._on
 
     def describe(self) -> dict[str, str]:
@@ -84,5 +84,5 @@ class ManualSource(LightSource):
 
 
 def open(config: Config, lines: LineRegistry, ask: Ask | None = None, *, yes: bool = False) -> ManualSource:
-    """Make the source; asks nothing yet. `lines` is there because every kind of source is opened alike."""
+    """Make the source; asks nothing yet. `lines` is unused: every kind of source is opened with the same arguments."""
     return ManualSource(config, ask, yes=yes)
