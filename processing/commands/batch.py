@@ -61,12 +61,12 @@ def run_batch(
     """
     if len(inputs) == 1:
         with progress_bar(what, unit) as tick:
-            made = make(inputs[0], tick)
+            output = make(inputs[0], tick)
         if print_result is None:
-            typer.echo("\n".join(map(str, made.paths)))
+            typer.echo("\n".join(map(str, output.paths)))
         else:
-            print_result(made)
-        if made.is_unchanged:
+            print_result(output)
+        if output.is_unchanged:
             typer.echo("unchanged: made before of the same inputs with the same options")
         return
     counts = {word: 0, "unchanged": 0, "failed": 0}
@@ -75,7 +75,7 @@ def run_batch(
     with batch_bar(what, len(inputs)) as bar:
         for path in inputs:
             try:
-                made = make(path, bar.tick)
+                output = make(path, bar.tick)
             except Exception as error:  # noqa: BLE001  # whatever is wrong with one input, the others are done
                 text, code = reason_of(path, error)
                 failures.append(text)
@@ -83,10 +83,10 @@ def run_batch(
                 counts["failed"] += 1
                 bar.finish(f"failed     {text}", failed=True)
                 continue
-            result = "unchanged" if made.is_unchanged else word
+            result = "unchanged" if output.is_unchanged else word
             counts[result] += 1
-            more = f" and {len(made.paths) - 1} more" if len(made.paths) > 1 else ""
-            bar.finish(f"{result:10} {made.paths[0]}{more}{made.facts}")
+            more = f" and {len(output.paths) - 1} more" if len(output.paths) > 1 else ""
+            bar.finish(f"{result:10} {output.paths[0]}{more}{output.facts}")
     typer.echo(f"{len(inputs)} inputs: " + ", ".join(f"{number} {result}" for result, number in counts.items()))
     if worst:
         typer.echo("\n".join(["failed:", *(f"  {text}" for text in failures)]), err=True)
@@ -125,18 +125,18 @@ def make_products(
     def make(source: Path, tick: Progress) -> Made:
         step, start = step_of(source, tick)
         target = place(step.usual_path)
-        if (other := sources.setdefault(os.path.realpath(target), source)) != source:
-            raise ProcessError(f"its product {target} is that of {other} too. Rename one of them.")
-        found = step.kept_or_made(target, overwrite, tick)
+        if (first_source := sources.setdefault(os.path.realpath(target), source)) != source:
+            raise ProcessError(f"its product {target} is that of {first_source} too. Rename one of them.")
+        product = step.kept_or_made(target, overwrite, tick)
         if not several:
             first.extend([start] if start else [])
-            return Made((found.path,), found.was_there)
-        for made in (start, found):
-            if made is not None and not (made is start and made.was_there):
-                print_warnings(made.path, f"{made.path.name}: ")
-        if not (found.was_there and found.path.with_suffix(".png").exists()):
-            draw(found.path, None, no_figure, silent=True)
-        return Made((found.path,), found.was_there, one_line(found.path))
+            return Made((product.path,), product.was_there)
+        for result in (start, product):
+            if result is not None and not (result is start and result.was_there):
+                print_warnings(result.path, f"{result.path.name}: ")
+        if not (product.was_there and product.path.with_suffix(".png").exists()):
+            draw(product.path, None, no_figure, silent=True)
+        return Made((product.path,), product.was_there, one_line(product.path))
 
     def print_result(made: Made) -> None:
         for start in first:
@@ -211,17 +211,17 @@ def files_of(
     ------
     ProcessError : a folder holds nothing to take.
     """
-    found: list[Path] = []
+    files: list[Path] = []
     for source in sources:
         if not source.is_dir():
-            found.append(source)
+            files.append(source)
             continue
         inside = [p for ending in endings for p in source.rglob(f"*{ending}") if p.is_file() and _shown(p, source)]
-        taken = [p for p in sorted(inside, key=natural) if _takes(takes, p)]
-        if not taken:
+        selection = [p for p in sorted(inside, key=natural) if _takes(takes, p)]
+        if not selection:
             raise ProcessError(f"{source} holds no {what}. Give files, or the folder that they are in.")
-        found += taken
-    return list({os.path.realpath(path): path for path in found}.values())
+        files += selection
+    return list({os.path.realpath(path): path for path in files}.values())
 
 
 def captures_and(products: Iterable[str]) -> Callable[[Path], bool]:

@@ -64,11 +64,11 @@ def calibrate_command(
         where = f"rows {rows.start}:{rows.stop}, columns {columns.start}:{columns.stop}"
         titles.append(f"{capture.name}: {where}, {nm:g} nm")
     curves = None if dispersion is None else fit_curves(parts, free.split(","), dispersion)
-    found = fit_trains(parts, free.split(",")) if curves is None else curves.calibrations
-    fitted: dict[float, FittedValues] = {p.wavelength_nm: r for p, r in zip(parts, found, strict=True)}
+    calibrations = fit_trains(parts, free.split(",")) if curves is None else curves.calibrations
+    fitted: dict[float, FittedValues] = {p.wavelength_nm: r for p, r in zip(parts, calibrations, strict=True)}
     if simulated:
         typer.echo("SIMULATED data")
-    for title, result in zip(titles, found, strict=True):
+    for title, result in zip(titles, calibrations, strict=True):
         _tell(title, result)
         typer.echo(f"  residual {100 * result.residual_over_mean:.3f} % of the mean signal (rms)")
     if curves is not None:
@@ -76,7 +76,7 @@ def calibrate_command(
             fitted[nm] = curves.at(model, nm)
             _tell(f"{nm:g} nm, from the curves", fitted[nm])
         _tell_curves(curves)
-    worst = max(result.residual_over_mean for result in found)
+    worst = max(result.residual_over_mean for result in calibrations)
     if worst > POOR_FIT:
         typer.echo("warning: a poor fit; start from values closer to the truth, or free more parameters", err=True)
     if write is not None:

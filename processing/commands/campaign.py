@@ -71,10 +71,10 @@ def campaign_command(
     if correct and geometry is not None:
         raise ProcessError("--correct is without --geometry. First: process campaign --correct, then --instrument FILE")
     target = out or folder / "campaign"
-    taken = tuple(mode or ()), tuple(sample or ())
+    selection = tuple(mode or ()), tuple(sample or ())
     if geometry is not None and material is not None:
         step = ProcessedCampaign(
-            folder, target, geometry, material, stokes_geometry, registered, border, instrument, *taken
+            folder, target, geometry, material, stokes_geometry, registered, border, instrument, *selection
         )
         with executor(workers, scheduler) as pool, progress_bar("campaign", "captures") as tick:
             result = step.run(pool, tick)
@@ -82,12 +82,12 @@ def campaign_command(
         left_out, failed = result.left_out, result.failed
     else:
         corrected = _corrected(folder, target) if correct else {}
-        curves = Curves(folder, target, region, instrument, corrected, *taken)
+        curves = Curves(folder, target, region, instrument, corrected, *selection)
         with executor(workers, scheduler) as pool, progress_bar("campaign", "captures") as tick:
-            found, simulated, omitted = curves.run(pool, tick)
+            results, simulated, omitted = curves.run(pool, tick)
         left_out = tuple(omitted)
-        failed = tuple((path, one) for path, one in found if isinstance(one, Exception))
-        points = [one for _, one in found if not isinstance(one, Exception)]
+        failed = tuple((path, point) for path, point in results if isinstance(point, Exception))
+        points = [point for _, point in results if not isinstance(point, Exception)]
         _show_means(points, quantity, folder.name, target, simulated=simulated)
     for text in left_out:
         typer.echo(f"left out: {text}", err=True)
@@ -127,7 +127,7 @@ def _show_means(
     if simulated:
         typer.echo("SIMULATED data")
     for point in points:
-        by_name = {one.name: one for one in point.means}
+        by_name = {mean.name: mean for mean in point.means}
         first = by_name[next(name for name in CURVES[2:] if name in by_name)]
         text = f"{first.name.replace('_', ' ')} {first.value:.4g} +- {first.u:.2g}"
         typer.echo(f"{'unchanged' if point.is_unchanged else 'made':10} {point.product}  {text}")
@@ -173,7 +173,7 @@ def _corrected(folder: Path, target: Path) -> dict[Path, Path]:
             airs.setdefault(text, []).append(path)
     if not airs:
         raise ProcessError(f"{folder} has no capture of air for --correct. Take one: acquire --sample air --omega 180")
-    found: dict[Path, Path] = {}
+    instruments: dict[Path, Path] = {}
     for number, (text, air) in enumerate(airs.items(), 1):
         made_of = "of air: " + ", ".join(f"{path.name} {str(content_of(file_identity(path)))[:16]}" for path in air)
         file = target / ("corrected.yaml" if len(airs) == 1 else f"corrected_{number}.yaml")
@@ -190,8 +190,8 @@ def _corrected(folder: Path, target: Path) -> dict[Path, Path]:
                 typer.echo(f"the captures are reduced with their own models: {error}")
                 continue
         typer.echo(f"instrument of {len(captures[text])} captures, by {len(air)} of air: {file}")
-        found |= dict.fromkeys(captures[text], file)
-    return found
+        instruments |= dict.fromkeys(captures[text], file)
+    return instruments
 
 
 COLUMNS = (

@@ -34,10 +34,10 @@ def check_command(
     from processing.reports.drift_figure import draw_drift
     from processing.storage.captures.capture import made_of_captures
 
-    kept = comparable(reference)
+    conditions = comparable(reference)
 
     def takes(path: Path) -> bool:
-        return not made_of_captures(path) and comparable(path) == kept and not path.samefile(reference)
+        return not made_of_captures(path) and comparable(path) == conditions and not path.samefile(reference)
 
     inputs = files_of(captures, takes, f"captures to compare with {reference}")
     changes: dict[Path, Change] = {}
@@ -45,9 +45,9 @@ def check_command(
     def make(capture: Path, tick: Progress) -> Made:
         require_distinct([capture, reference])
         change = changes[capture] = compare(capture, reference, instrument, tolerance, progress=tick)
-        one, several = change.largest, len(inputs) > 1
+        top, several = change.largest, len(inputs) > 1
         table = keep(change, reference)
-        return Made((capture if several else table,), several and not change.count, f"  {one.name} by {one.value:+.2g}")
+        return Made((capture if several else table,), several and not change.count, f"  {top.name} by {top.value:+.2g}")
 
     def print_result(made: Made) -> None:
         (change,), (table,) = changes.values(), made.paths
@@ -75,9 +75,9 @@ def _print_change(found: Change, reference: Path, tolerance: float) -> None:
         typer.echo("SIMULATED data")
     typer.echo(f"{'changed' if found.count else 'unchanged'} since {reference.name}")
     typer.echo(f"  light: {100 * found.light.value:+.2f} +- {100 * found.light.error:.2g} %")
-    one, (rows, columns) = found.largest, found.largest.region
+    largest, (rows, columns) = found.largest, found.largest.region
     place = f"rows {rows.start}:{rows.stop}, columns {columns.start}:{columns.stop}"
-    typer.echo(f"  largest change over m00: {one.name} by {one.value:+.2g} +- {one.error:.1g} in {place}")
+    typer.echo(f"  largest change over m00: {largest.name} by {largest.value:+.2g} +- {largest.error:.1g} in {place}")
     typer.echo(f"  {found.count} of {found.tests} comparisons beyond noise and the tolerance of {tolerance:g}")
 
 

@@ -26,7 +26,7 @@ atexit.register(gc.freeze)
 
 def shown(text: object) -> str:
     """Text as a terminal may get it: control characters of file names and devices as escapes, lines as they are."""
-    return CONTROL.sub(lambda found: found[0] if found[0] in "\n\t" else ascii(found[0])[1:-1], str(text))
+    return CONTROL.sub(lambda match: match[0] if match[0] in "\n\t" else ascii(match[0])[1:-1], str(text))
 
 
 def _tell_version(wanted: bool) -> None:
@@ -98,24 +98,24 @@ class Application(typer.Typer):
 
 
 def _in_our_words(error: TyperException) -> str:
-    said, context = error.format_message().rstrip("."), getattr(error, "ctx", None)
-    if said.startswith("Usage:"):
+    text, context = error.format_message().rstrip("."), getattr(error, "ctx", None)
+    if text.startswith("Usage:"):
         # A command without arguments: its help is the answer.
-        return said
+        return text
     parameter, cause = getattr(error, "param", None), error.__cause__
     if parameter is not None and isinstance(cause, ValueError) and hasattr(cause, "errors"):
         wrong = cause.errors()[0]
         name = parameter.opts[0] if parameter.opts else parameter.name
-        wanted = wrong["msg"].removeprefix("Input should be ").partition(", unable")[0]
+        expected = wrong["msg"].removeprefix("Input should be ").partition(", unable")[0]
         explained = f" ({parameter.help})" if getattr(parameter, "help", None) else ""
-        said = f"{name} {wrong['input']}: must be {wanted}{explained}"
+        text = f"{name} {wrong['input']}: must be {expected}{explained}"
     if context is None:
-        return f"error: {said}"
+        return f"error: {text}"
     # As the user started this program: `UMOV_DOOR` is set by ./lab.
     words = context.command_path.split()
     if words[0] == "umov":
         words[0] = os.environ.get("UMOV_DOOR", "umov")
-    return f"error: {said}; {' '.join(words)} -h tells more"
+    return f"error: {text}; {' '.join(words)} -h tells more"
 
 
 def application(name: str, text: str) -> Application:

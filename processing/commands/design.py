@@ -80,8 +80,8 @@ def design_command(
 
     model = InstrumentModel.load(instrument)
     if wavelength is None and model.wavelengths_nm and len(model.wavelengths_nm) > 1:
-        known = ", ".join(f"{nm:g}" for nm in model.wavelengths_nm)
-        raise ProcessError(f"{instrument} is given at {known} nm: choose one with --wavelength")
+        listed = ", ".join(f"{nm:g}" for nm in model.wavelengths_nm)
+        raise ProcessError(f"{instrument} is given at {listed} nm: choose one with --wavelength")
     nm = wavelength if wavelength is not None else (model.wavelengths_nm or (0.0,))[0]
     model = model.at(nm) if nm else model
     noise = AssumedNoise(electrons, read_noise)
@@ -97,10 +97,10 @@ def design_command(
         chosen = _given(model, counts, ratio, step, table=table)
         w = model.rows(chosen.angles_deg, changes_at(model, chosen.angles_deg))
         intensities = len(chosen) * len(model.channels)
-        found = score(w, noise, determined_basis(model), bound_of(model, intensities))
+        result = score(w, noise, determined_basis(model), bound_of(model, intensities))
         at = f", {nm:g} nm" if nm else ""
-        _show(f"{model.name}{at}, {len(chosen)} states", found, noise)
-        if found.rank == found.wanted:
+        _show(f"{model.name}{at}, {len(chosen)} states", result, noise)
+        if result.rank == result.wanted:
             from processing.commands.loaded_late.design_angles import tell_robustness
 
             tell_robustness(model, chosen.angles_deg)
@@ -113,12 +113,12 @@ def _counts(text: str) -> list[int]:
     from processing.errors import ProcessError
 
     try:
-        found = [int(part) for part in text.split(",")]
+        counts = [int(part) for part in text.split(",")]
     except ValueError as error:
         raise ProcessError(f"--states {text!r}: give whole numbers, for instance 40 or 24,30,40") from error
-    if min(found) < 1:
+    if min(counts) < 1:
         raise ProcessError(f"--states {text!r}: a table has at least one state")
-    return found
+    return counts
 
 
 def _present(

@@ -56,7 +56,7 @@ def diagnose_command(
     with progress_line("diagnose", verbose) as say:
         judged, problem = diagnose_captures(captures, model, say)
     # Files first: who reads the words may go before their end.
-    made = [str(path) for path in (report, residuals, write) if path is not None]
+    lines = [str(path) for path in (report, residuals, write) if path is not None]
     if json is not None:
         write_result(json, judged.diagnosis)
     if report is not None:
@@ -72,11 +72,11 @@ def diagnose_command(
 
         write_instrument(write, model, judged.diagnosis)
         if not judged.diagnosis.corrects:
-            made[-1:-1] = [
+            lines[-1:-1] = [
                 "nothing is corrected; the file adds how wrong M may be, for the error bars of `process reduce`"
             ]
     show(judged.diagnosis, verbose, written=write is not None)
-    for line in made:
+    for line in lines:
         typer.echo(line)
 
 

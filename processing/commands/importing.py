@@ -135,24 +135,24 @@ def import_command(
             Path(item): replace(for_item(request, item), out=place(name_of_item(item))) for item in dict.fromkeys(items)
         }
     if dry_run:
-        for item, one in requests.items():
+        for item, job in requests.items():
             if items:
                 typer.echo(f"{item}:")
-            show_understood(one)
+            show_understood(job)
         return
     sources: dict[Path, Path] = {}
 
     def make(item: Path, tick: Progress) -> Made:
-        one = requests[item]
-        if (other := sources.setdefault(one.out, item)) != item:
-            raise ProcessError(f"its capture {one.out} is that of {other} too. Import one of them with another --out.")
-        kept, text = one.out.with_suffix(".import.yaml"), recipe_text(context, one)
-        is_same = kept.is_file() and kept.read_text(encoding="utf-8", errors="replace") == text
-        if is_same and not overwrite and is_imported(one):
-            return Made((one.out,), True)
-        import_capture(one, tick)
-        write_whole_text(kept, text)
-        return Made((one.out,), False)
+        job = requests[item]
+        if (twin := sources.setdefault(job.out, item)) != item:
+            raise ProcessError(f"its capture {job.out} is that of {twin} too. Import one of them with another --out.")
+        file, text = job.out.with_suffix(".import.yaml"), recipe_text(context, job)
+        is_same = file.is_file() and file.read_text(encoding="utf-8", errors="replace") == text
+        if is_same and not overwrite and is_imported(job):
+            return Made((job.out,), True)
+        import_capture(job, tick)
+        write_whole_text(file, text)
+        return Made((job.out,), False)
 
     run_batch("importing", "states", list(requests), make, print_result=_print_imported)
 

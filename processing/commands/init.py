@@ -85,7 +85,7 @@ def ask(prompt: Callable[..., str]) -> str:
         *_elements("analyzer", analyzer, "psa", analyzer_deg, turning=psa),
     ]
     text = "\n".join(lines) + "\n" + (_CAMERA if analyzer.endswith("camera") else "")
-    nominal = [f"{side}_retarder.retardance_deg" for side, one in (("psg", psg), ("psa", psa)) if one.retardance_deg]
+    nominal = [f"{side}_retarder.retardance_deg" for side, axis in (("psg", psg), ("psa", psa)) if axis.retardance_deg]
     if nominal:
         text += "# Only nominal: `diagnose` fits them to a capture of air. Delete a line whose value is measured.\n"
         text += "calibrate:\n" + "".join(f"  - {value}\n" for value in nominal)
@@ -102,22 +102,22 @@ class _Turning:
 def _turning(prompt: Callable[..., str], number: int, axis: str, kind: str) -> _Turning:
     if not kind.startswith("turning"):
         return _Turning()
-    own = prompt(f"{number}. Name of the axis that turns it, a column of your table", default=axis).strip()
+    axis_name = prompt(f"{number}. Name of the axis that turns it, a column of your table", default=axis).strip()
     if "retarder" not in kind:
-        return _Turning(own)
-    return _Turning(own, _numbers(prompt, f"{number + 1}. Retardance in degrees (nominal)", "90")[0])
+        return _Turning(axis_name)
+    return _Turning(axis_name, _numbers(prompt, f"{number + 1}. Retardance in degrees (nominal)", "90")[0])
 
 
 def _elements(side: str, kind: str, short: str, polarizer_deg: float, *, turning: _Turning) -> list[str]:
     axis = f", axis: {_quoted(turning.axis)}" if turning.axis else ""
     retarder = f"  - {{kind: retarder, name: {short}_retarder{axis}, azimuth_deg: 0, retardance_deg: "
     retarder += f"{turning.retardance_deg or 0:g}}}"
-    own = axis if "retarder" not in kind else ""
-    polarizer = f"  - {{kind: polarizer, name: {short}_polarizer{own}, azimuth_deg: {polarizer_deg:g}}}"
-    found = [polarizer] if "polarizer" in kind or kind == "turning-retarder" else []
+    polarizer_axis = axis if "retarder" not in kind else ""
+    polarizer = f"  - {{kind: polarizer, name: {short}_polarizer{polarizer_axis}, azimuth_deg: {polarizer_deg:g}}}"
+    elements = [polarizer] if "polarizer" in kind or kind == "turning-retarder" else []
     if "retarder" in kind:
-        found = [*found, retarder] if side == "generator" else [retarder, *found]
-    return [f"{side}:", *found] if found else [f"{side}: []"]
+        elements = [*elements, retarder] if side == "generator" else [retarder, *elements]
+    return [f"{side}:", *elements] if elements else [f"{side}: []"]
 
 
 def _choice(prompt: Callable[..., str], question: str, choices: dict[str, str]) -> str:

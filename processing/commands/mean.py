@@ -60,35 +60,35 @@ def mean_command(
     if any(place != places[0] for place in places):
         raise ProcessError("the captures have frames of several sizes. Name the pixels: --region r0:r1,c0:c1")
     rows, columns = places[0]
-    found = mean_of(products, places[0])
+    means = mean_of(products, places[0])
     place = f"rows {rows.start}:{rows.stop}, columns {columns.start}:{columns.stop}"
     captures = f"{len(products)} capture{'s' if len(products) > 1 else ''}"
     if simulated:
         typer.echo("SIMULATED data")
     typer.echo(f"mean of {place} of {captures}; intervals of 95 %")
-    if all(len(one.budget) == 1 for one in found):
+    if all(len(mean.budget) == 1 for mean in means):
         typer.echo(
             "warning: the instrument file states no uncertainty, so the intervals contain none. Write values as "
             "{value: ..., u: ...}, or run: process calibrate AIR.h5 --instrument FILE --free NAMES --write NEW.yaml",
             err=True,
         )
     if budget is None:
-        _print_means(found)
+        _print_means(means)
     else:
-        _print_budget(found, budget)
+        _print_budget(means, budget)
     if out is not None:
         facts = {"captures": ", ".join(path.name for path in inputs), "pixels": place, "simulated": simulated}
-        write_means(out, found, facts)
+        write_means(out, means, facts)
         typer.echo(str(out))
 
 
 def _print_means(found: Sequence[MeanValue]) -> None:
     head = ("quantity", "value", "u noise", "u instrument", "scatter", "dof", "interval")
     typer.echo("{:38} {:>11} {:>9} {:>12} {:>9} {:>6}  {}".format(*head))
-    for one in found:
+    for mean in found:
         typer.echo(
-            f"{one.name:38} {one.value:11.5g} {one.u_noise:9.2g} {one.u_systematic:12.2g} {one.scatter:9.2g} "
-            f"{one.degrees_of_freedom:6.3g}  {one.low:.5g} to {one.high:.5g} {one.unit}"
+            f"{mean.name:38} {mean.value:11.5g} {mean.u_noise:9.2g} {mean.u_systematic:12.2g} {mean.scatter:9.2g} "
+            f"{mean.degrees_of_freedom:6.3g}  {mean.low:.5g} to {mean.high:.5g} {mean.unit}"
         )
 
 
@@ -96,10 +96,10 @@ def _print_budget(found: Sequence[MeanValue], name: str) -> None:
     from processing.errors import ProcessError
     from processing.maps.means import BUDGET_COLUMNS
 
-    one = next((value for value in found if value.name == name), None)
-    if one is None:
+    mean = next((value for value in found if value.name == name), None)
+    if mean is None:
         raise ProcessError(f"--budget {name}: no such quantity. Choose one of: {', '.join(v.name for v in found)}")
-    typer.echo(f"{one.name} = {one.value:.6g} {one.unit}")
-    for line in (BUDGET_COLUMNS, *one.budget_lines):
+    typer.echo(f"{mean.name} = {mean.value:.6g} {mean.unit}")
+    for line in (BUDGET_COLUMNS, *mean.budget_lines):
         typer.echo("  {:50} {:>9} {:>11} {:>12} {:>7} {:>5}".format(*line))
-    typer.echo(f"  {one.interval_text}")
+    typer.echo(f"  {mean.interval_text}")

@@ -21,8 +21,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     # Of this distribution alone: the metadata of all installed packages take half a second to read.
-    found = distribution("umov")
-    commands = {point.name: point for point in found.entry_points if point.group == GROUP}
+    package = distribution("umov")
+    commands = {point.name: point for point in package.entry_points if point.group == GROUP}
     usage = (
         f"Usage: umov COMMAND [OPTIONS]\n\nCommands: {', '.join(commands)}\n\n`umov COMMAND -h` explains a command. "
     )
@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         typer.echo(usage)
         sys.exit(0 if words else 2)
     if words[0] == "--version":
-        typer.echo(f"umov {found.version}")
+        typer.echo(f"umov {package.version}")
         sys.exit(0)
     if words[0] not in commands and _is_of_process(words[0]):
         words.insert(0, "process")

@@ -44,6 +44,6 @@ def recipe_text(context: typer.Context, request: ImportRequest) -> str:
     """The options of this run as a recipe, with the files of one request."""
     names = {**context.params, "states": request.states, "stack": request.stack, "darks": request.darks}
     names["columns"] = [f"{name}={column}" for name, column in request.columns.items()] or None
-    given = {name: names[name] for name in ImportRecipe.model_fields if names[name] is not None}
-    texts = {name: str(value) if isinstance(value, Path) else value for name, value in given.items()}
+    options = {name: names[name] for name in ImportRecipe.model_fields if names[name] is not None}
+    texts = {name: str(value) if isinstance(value, Path) else value for name, value in options.items()}
     return dump_yaml(ImportRecipe.model_validate(texts))

@@ -66,13 +66,13 @@ def fit_material_command(
     from processing.steps.material import MaterialFitting
 
     require_place(out, overwrite)
-    found = MaterialFitting(tuple(sources), geometry, name, correlation, kind).fitted()
-    fit = found.fit
-    if found.simulated:
+    fitting = MaterialFitting(tuple(sources), geometry, name, correlation, kind).fitted()
+    fit = fitting.fit
+    if fitting.simulated:
         typer.echo("SIMULATED data")
     for key, value, stderr in zip(fit.names, fit.constants, fit.stderr, strict=True):
-        known = "" if fit.identified[key] else "   NOT IDENTIFIED by these data"
-        typer.echo(f"  {key} = {value:.5g} +- {stderr:.2g}{known}")
+        remark = "" if fit.identified[key] else "   NOT IDENTIFIED by these data"
+        typer.echo(f"  {key} = {value:.5g} +- {stderr:.2g}{remark}")
     typer.echo(f"  method: {fit.method}; condition number {fit.condition:.3g}, {fit.pixels} pixels")
     typer.echo(f"  reduced chi-square against the known noise: {fit.chi_square:.3g}")
     if fit.correlation == fit.correlation:
@@ -81,7 +81,7 @@ def fit_material_command(
         )
     notes = fit.notes([p.name for p in sources])
     typer.echo("\n".join(f"  {note}" for note in notes[3:]))
-    found.save(out, overwrite)
+    fitting.save(out, overwrite)
     typer.echo(str(out))
 
 

@@ -21,15 +21,15 @@ def show_command(
     from processing.instrument.model import InstrumentModel
 
     model = InstrumentModel.load(instrument)
-    found = influences(model, wavelength_nm)
-    if not found:
+    effects = influences(model, wavelength_nm)
+    if not effects:
         typer.echo(f"{instrument}: no value of `diagnose`. Write some: diagnose CAPTURE --write NEW.yaml")
-    for one in found:
+    for influence in effects:
         change = "its change of M depends on the capture"
-        if one.change is not None:
-            what = "one standard error" if one.fitted else "it"
-            change = f"{what} changes M/m00 of air by {one.change:.2g} rms"
-        typer.echo(f"{one.name}: {one.value}")
-        typer.echo(f"  holds for {one.scope}; {change}")
+        if influence.change is not None:
+            size = "one standard error" if influence.fitted else "it"
+            change = f"{size} changes M/m00 of air by {influence.change:.2g} rms"
+        typer.echo(f"{influence.name}: {influence.value}")
+        typer.echo(f"  holds for {influence.scope}; {change}")
     for error in model.systematic:
         typer.echo(f"still uncertain: M/m00 by {error.rms_over_m00:.2g} rms, in {len(error.directions)} directions")

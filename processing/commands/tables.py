@@ -94,12 +94,12 @@ def compare_command(
             typer.echo(f"warning: no uncertainty of its instrument is known to {path}; u instr. has none", err=True)
     typer.echo("  Omega     xi0/%    u noise  u instr.    common")
     for angle in angles:
-        found = compare_on_sphere(a, b, view, angle, shape=(size, size))
-        if not found["common"]:
+        comparison = compare_on_sphere(a, b, view, angle, shape=(size, size))
+        if not comparison["common"]:
             typer.echo(f"  {angle:5g}  no direction in which both tables have a value")
             continue
-        shown = (f"{found[f'xi0_{part}percent']:9.3f}" for part in ("", "noise_", "systematic_"))
-        typer.echo(f"  {angle:5g} {'  '.join(shown)} {found['common']:9.3f}")
+        shown = (f"{comparison[f'xi0_{part}percent']:9.3f}" for part in ("", "noise_", "systematic_"))
+        typer.echo(f"  {angle:5g} {'  '.join(shown)} {comparison['common']:9.3f}")
     with whole_file(figure) as new:
         tables_figure(a, b, view, angles[0], shape=(size, size)).savefig(new, dpi=150)
     typer.echo(str(figure))
@@ -152,10 +152,10 @@ def import_command(
     from processing.reflectance.pbsdf import load
 
     typer.echo(f"  reading three million bins of {source}", err=True)
-    found = load(source, only_nm=wavelength_nm)
-    if not found:
+    tables = load(source, only_nm=wavelength_nm)
+    if not tables:
         raise ProcessError(f"{source} has no wavelength {wavelength_nm:g} nm.")
-    table = next(iter(found.values()))
+    table = next(iter(tables.values()))
     table.save(out)
     typer.echo(f"  bins: {table.bins.size}")
     typer.echo(str(out))

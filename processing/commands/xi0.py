@@ -45,8 +45,8 @@ def xi0_command(
         image = reduced(source, instrument, tick)
         with Product(image.path) as product:
             if product.kind == "mueller" and seen_elements(product.facts).all() and (geometry or material):
-                told = "holds whole Mueller matrices: --geometry and --material are not looked at"
-                typer.echo(f"warning: {image.path} {told}", err=True)
+                text = "holds whole Mueller matrices: --geometry and --material are not looked at"
+                typer.echo(f"warning: {image.path} {text}", err=True)
         return Xi0(image.path, geometry, material), image if image.path != source else None
 
     # Without a model of the dominant process, Stokes images have no xi0.

@@ -41,14 +41,14 @@ def optimize_angles(
         raise ProcessError(f"--optimize {free!r}: free angles go with retardances, not with a ratio")
     model = model.model_copy(update={"effects": ()})
     goal = Goal(noise if weighted else None, jitter_deg)
-    given = dict(Speed.parse(text) for text in speeds)
-    unknown = sorted(set(given) - set(model.axes))
+    limits = dict(Speed.parse(text) for text in speeds)
+    unknown = sorted(set(limits) - set(model.axes))
     if unknown:
         raise ProcessError(f"--speed {unknown[0]}: the instrument turns {', '.join(model.axes)}")
     for n, present in now.items():
         with progress_bar(f"{n} states", "starts") as tick:
-            if given:
-                points = front(model, n, given, goal, free_retardances="retardances" in names, progress=tick)
+            if limits:
+                points = front(model, n, limits, goal, free_retardances="retardances" in names, progress=tick)
             else:
                 points = [Point(free_design(model, n, goal, "retardances" in names, progress=tick), float("nan"))]
         best = points[0].design
@@ -57,8 +57,8 @@ def optimize_angles(
         _show(model, n, best)
         if present is not None:
             _show_present(model, noise, present, "retardances" in names)
-        if given:
-            _show_front(model, n, points, given)
+        if limits:
+            _show_front(model, n, points, limits)
         tell_robustness(with_retardances(model, best.retardances_deg), best.angles_deg)
     return StateTable.of_angles(best.angles_deg)
 
@@ -72,8 +72,8 @@ def tell_robustness(model: InstrumentModel, angles_deg: Mapping[str, Array]) -> 
 
 def _show(model: InstrumentModel, states: int, best: FreeDesign) -> None:
     plates = ", ".join(f"{name} {value:.1f}" for name, value in best.retardances_deg.items())
-    told = f", retardances {plates} degrees" if plates else ""
-    typer.echo(f"{states} states, free angles, rank {best.rank}{told}")
+    suffix = f", retardances {plates} degrees" if plates else ""
+    typer.echo(f"{states} states, free angles, rank {best.rank}{suffix}")
     typer.echo(
         f"  equally weighted variance {best.variance:.4f}; the bound for {states * len(model.channels)} intensities "
         f"is {best.bound:.4f} ({best.variance / best.bound - 1:+.2%})"
@@ -82,9 +82,9 @@ def _show(model: InstrumentModel, states: int, best: FreeDesign) -> None:
 
 def _show_present(model: InstrumentModel, noise: AssumedNoise, now: StateTable, with_plates: bool) -> None:
     basis, intensities = determined_basis(model), len(now) * len(model.channels)
-    found = score(model.rows(now.angles_deg), noise, basis, bound_of(model, intensities))
-    is_whole = found.rank == found.wanted
-    variance = f"{found.equally_weighted_variance:.4f}" if is_whole else f"rank {found.rank} of {found.wanted}"
+    result = score(model.rows(now.angles_deg), noise, basis, bound_of(model, intensities))
+    is_whole = result.rank == result.wanted
+    variance = f"{result.equally_weighted_variance:.4f}" if is_whole else f"rank {result.rank} of {result.wanted}"
     change = "the table, and plates of these retardances" if with_plates else "the table alone"
     typer.echo(f"  the table as it is, {len(now)} states: {variance}; to change at the bench: {change}")
 

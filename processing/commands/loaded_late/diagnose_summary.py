@@ -114,8 +114,8 @@ def _answer(effect: FoundEffect) -> str:
 
 
 def _name_capture(short: Mapping[str, str], c: CaptureReport) -> None:
-    one = short.get(c.name, "capture")
-    line = f"  {one}  {c.name}" + (f", {c.wavelength_nm:g} nm" if c.wavelength_nm else "")
+    label = short.get(c.name, "capture")
+    line = f"  {label}  {c.name}" + (f", {c.wavelength_nm:g} nm" if c.wavelength_nm else "")
     if short and c.error_before is not None and c.error_after is not None:
         line += f": {c.error_before.told_beside(c.error_after)}"
     if c.source_percent is not None:
@@ -133,8 +133,8 @@ def _show_uncertainty(d: Diagnosis, written: bool) -> None:
     if correction.mueller is not None:
         typer.echo(f"{correction.mueller.told}")
     if correction.refused is not None and not any(e.not_applied for e in d.effects):
-        what = "but for the fitted train, nothing" if d.corrects else "nothing"
-        typer.echo(f"{what} is applied, because {correction.refused}")
+        subject = "but for the fitted train, nothing" if d.corrects else "nothing"
+        typer.echo(f"{subject} is applied, because {correction.refused}")
     elif not (d.corrects or d.effects or written):
         typer.echo("nothing is corrected")
 
@@ -178,8 +178,8 @@ def _show_unexplained(short: Mapping[str, str], unexplained: Unexplained, rankin
     _say(short, "unexplained structure is left:")
     for line in unexplained.description:
         _say(short, f"   {line}")
-    for one in ranking[:MOST_NEAR]:
-        typer.echo(f"   {one.candidate} alone would leave {one.rms_percent:.4f} %, and is no explanation")
+    for candidate in ranking[:MOST_NEAR]:
+        typer.echo(f"   {candidate.candidate} alone would leave {candidate.rms_percent:.4f} %, and is no explanation")
 
 
 def _combination(c: Combination) -> str:

@@ -42,19 +42,19 @@ def diagnose_reflectance(
     with progress_line("diagnose", verbose) as say:
         judged, problem = diagnose_object(captures, model, material, view, say=say)
     # Files first: who reads the words may go before their end.
-    made = []
+    files = []
     if json is not None:
         write_result(json, judged.diagnosis)
     if report is not None:
         from processing.diagnosis.surface.report import write_surface_report
 
         write_surface_report(report, judged, problem)
-        made.append(report)
+        files.append(report)
     if write is not None:
-        made += write_surface(write, judged.diagnosis, material, view, instrument=model)
+        files += write_surface(write, judged.diagnosis, material, view, instrument=model)
     show(judged.diagnosis, verbose, written=write is not None)
     _show_surface(judged.diagnosis)
-    for path in made:
+    for path in files:
         typer.echo(str(path))
 
 

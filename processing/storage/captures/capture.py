@@ -69,11 +69,11 @@ class Capture(OpenH5):
 
     def _read(self) -> None:
         if "umov_schema" not in self._h5.attrs:
-            made = next((what for mark, what in MADE_OF_CAPTURES.items() if mark in self._h5.attrs), None)
+            source = next((name for mark, name in MADE_OF_CAPTURES.items() if mark in self._h5.attrs), None)
             raise NotACapture(
                 f"{self.path} is HDF5 but no umov capture. If it comes from elsewhere, use `process import`."
-                if made is None
-                else f"{self.path} is {made}, and a capture is asked for: the file that it was made from."
+                if source is None
+                else f"{self.path} is {source}, and a capture is asked for: the file that it was made from."
             )
         version = int(self._h5.attrs["umov_schema"])
         if version != self._h5.attrs["umov_schema"] or version < 1:
@@ -106,14 +106,14 @@ class Capture(OpenH5):
 
     def _verified_sums(self, entry: h5py.Group) -> NDArray[np.uint32] | None:
         """Checksums of the rows (states done, channels, rows), None without any; the states' own are verified here."""
-        told = entry["states/crc32"][...][self.done]
-        if np.all(told == NONE):
+        crc = entry["states/crc32"][...][self.done]
+        if np.all(crc == NONE):
             return None
         sums: NDArray[np.uint32] = entry["instrument/detector/row_crc32"][...][self.done]
         columns = {name: column[self.done] for name, column in summed_values(entry).items()}
-        for k in np.flatnonzero(told != NONE):
+        for k in np.flatnonzero(crc != NONE):
             values = {name: column[k] for name, column in columns.items()}
-            if state_crc32(sums[k], values) != told[k]:
+            if state_crc32(sums[k], values) != crc[k]:
                 self._contradictory.append(int(k))
         if self._verifying and self._contradictory:
             raise self._changed(self._contradictory[0], "its angles or columns")
@@ -164,9 +164,9 @@ class Capture(OpenH5):
         """The largest count that the camera could send, as its frames have shown; None where nobody looked."""
         if not self.has_column("full_scale_counts"):
             return None
-        known = self.column("full_scale_counts")
+        counts = self.column("full_scale_counts")
         # The end may have been found in a later state: it held for the earlier ones too.
-        return None if not np.isfinite(known).any() else float(np.nanmin(known))
+        return None if not np.isfinite(counts).any() else float(np.nanmin(counts))
 
     @property
     def reduces_to(self) -> Literal["mueller", "stokes"]:

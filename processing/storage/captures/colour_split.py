@@ -41,9 +41,9 @@ def split_colours(path: Path, folder: Path) -> tuple[list[Path], bool]:
         content = content_of(file_identity(path))
         if all(_is_part(file, content) for file in out.values()):
             return list(out.values()), True
-        there = [str(file) for file in out.values() if file.exists()]
-        if there:
-            raise ProcessError(f"{', '.join(there)} exists. Give another --out.")
+        existing = [str(file) for file in out.values() if file.exists()]
+        if existing:
+            raise ProcessError(f"{', '.join(existing)} exists. Give another --out.")
         folder.mkdir(parents=True, exist_ok=True)
         for name, (rows, columns) in parts.items():
             _write(capture, name, out[name], rows, columns=columns, content=content)

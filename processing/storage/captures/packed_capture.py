@@ -51,8 +51,8 @@ def pack_capture(path: Path) -> tuple[int, int] | None:
 
 
 def _write(capture: Capture, old: h5py.File, new: Path) -> None:
-    there = old["entry"]
-    roles = tuple(role.decode() for role in there["states/role"][...])
+    source = old["entry"]
+    roles = tuple(role.decode() for role in source["states/role"][...])
     header = capture.header.model_copy(update={"camera_nodes": capture.camera_nodes})
     with h5py.File(new, "w") as h5:
         targets = capture.planned_targets_deg()
@@ -67,24 +67,24 @@ def _write(capture: Capture, old: h5py.File, new: Path) -> None:
             frames=create_packed,
         )
         entry = h5["entry"]
-        frames = there["instrument/detector/data"]
+        frames = source["instrument/detector/data"]
         pack(frames, entry["instrument/detector/data"], Packing.of(frames, SMALL_BYTE_WORTH))
-        entry["instrument/detector/row_crc32"][...] = there["instrument/detector/row_crc32"][...]
+        entry["instrument/detector/row_crc32"][...] = source["instrument/detector/row_crc32"][...]
         for axis in targets:
             for name in ("value", "raw_value"):
-                entry[f"instrument/{axis}/{name}"][...] = there[f"instrument/{axis}/{name}"][...]
+                entry[f"instrument/{axis}/{name}"][...] = source[f"instrument/{axis}/{name}"][...]
         for name in STATE_COLUMNS:
-            if name in there["states"]:
-                entry[f"states/{name}"][...] = there[f"states/{name}"][...]
+            if name in source["states"]:
+                entry[f"states/{name}"][...] = source[f"states/{name}"][...]
             else:
                 # An older file has not this column, and its checksums do not cover it.
                 del entry[f"states/{name}"]
-        if "sigma" in there["states"]:
-            there["states"].copy("sigma", entry["states"], without_attrs=True)
+        if "sigma" in source["states"]:
+            source["states"].copy("sigma", entry["states"], without_attrs=True)
             entry["states/sigma"].attrs["units"] = "count"
         for name in ("segments", "closing"):
-            if name in there:
-                put_record(entry, name, there[f"{name}/json"][...].tobytes().rstrip(b"\0"))
+            if name in source:
+                put_record(entry, name, source[f"{name}/json"][...].tobytes().rstrip(b"\0"))
         entry.attrs.modify("status", np.array(b"complete", dtype=STATUS_TYPE))
 
 

@@ -344,10 +344,10 @@ def fitted_json(closing: Mapping[str, Any], room: int) -> bytes:
     """
     record, left_out = dict(closing), dict[str, int]()
     while len(raw := json_bytes(record)) > room:
-        rest = set(record) - {"left_out"}
-        if not rest:
+        names = set(record) - {"left_out"}
+        if not names:
             return b"{}"
-        longest = max(rest, key=lambda name: len(json_bytes(record[name])))
+        longest = max(names, key=lambda name: len(json_bytes(record[name])))
         value = record.pop(longest)
         cut = 1
         if isinstance(value, (list, str)) and len(value) > 1:

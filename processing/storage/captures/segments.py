@@ -75,10 +75,10 @@ def decode_lines(raw: bytes) -> tuple[list[dict[str, Any]], int]:
     while (newline := raw.find(b"\n", end)) >= 0:
         line = raw[end:newline]
         try:
-            whole = int(line[:8], 16) == zlib.crc32(line[9:])
+            is_sound = int(line[:8], 16) == zlib.crc32(line[9:])
         except ValueError:
-            whole = False
-        if not whole:
+            is_sound = False
+        if not is_sound:
             break
         records.append(json.loads(line[9:]))
         end = newline + 1

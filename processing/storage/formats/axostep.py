@@ -129,13 +129,13 @@ def read_mueller_file(path: Path) -> MuellerFile:
             )
         reduced = floats[at + 1 : at + 1 + int(count) * pixels].reshape(pixels, int(count))
         at += 1 + int(count) * pixels
-    metadata, date, rest = _metadata(raw[at:].tobytes())
+    metadata, date, trailer = _metadata(raw[at:].tobytes())
     return MuellerFile(
         _as_image(mueller, wide, high).reshape(4, 4, high, wide),
         _as_image(reduced, wide, high),
         metadata,
         date,
-        rest,
+        trailer,
         header_words,
         float(floats[0]) if header_words == 5 else 0.0,
     )
@@ -163,8 +163,8 @@ def _mueller_header(path: Path, floats: NDArray[np.floating]) -> int:
     for words in (4, 5):
         if floats.size >= words:
             wide, high, rows, columns = (float(v) for v in floats[words - 4 : words])
-            whole = wide.is_integer() and high.is_integer() and wide > 0 and high > 0
-            if (rows, columns) == (4, 4) and whole and floats.size >= words + 16 * wide * high:
+            is_size = wide.is_integer() and high.is_integer() and wide > 0 and high > 0
+            if (rows, columns) == (4, 4) and is_size and floats.size >= words + 16 * wide * high:
                 return words
     start = ", ".join(f"{float(v):g}" for v in floats[:5])
     raise AxoStepError(
@@ -184,7 +184,7 @@ def _as_file(planes: NDArray[np.float32]) -> bytes:
 
 
 def _metadata(data: bytes) -> tuple[dict[str, float], datetime | None, bytes]:
-    found: dict[str, float] = {}
+    metadata: dict[str, float] = {}
     date: datetime | None = None
     at = 0
     for name in METADATA:
@@ -194,10 +194,10 @@ def _metadata(data: bytes) -> tuple[dict[str, float], datetime | None, bytes]:
         (value,) = struct.unpack_from(">d" if name == "date" else ">f", data, at)
         at += size
         if name != "date":
-            found[name] = value
+            metadata[name] = value
         elif np.isfinite(value) and 0 < value < 1e11:
             date = EPOCH + timedelta(seconds=value)
-    return found, date, data[at:]
+    return metadata, date, data[at:]
 
 
 def _metadata_bytes(image: MuellerFile) -> bytes:

@@ -51,12 +51,12 @@ def product_of_axostep(
         (file_identity(source, "source"),),
     )
     date = f", {image.date:%Y-%m-%d %H:%M} GMT" if image.date else ""
-    told = [
+    lines = [
         f"{columns} x {rows} pixels, {nm:g} nm{date}, {len(image.reduced)} reduced parameters (not taken over)",
         f"header of {image.header_words} words" + (" as the lab's reader expects" if image.header_words == 5 else ""),
     ]
     if not overwrite and out.is_file() and made_of(out) == step.made_of:
-        return told, True
+        return lines, True
     nothing = np.full((rows, columns), np.nan, np.float32)
     finite = np.isfinite(image.mueller).all(axis=(0, 1))
     facts: dict[str, Any] = {
@@ -79,7 +79,7 @@ def product_of_axostep(
             pixel_flags=np.where(finite, 0, np.uint8(Mask.NOT_FINITE)).astype(np.uint8),
         )
         writer.seal(facts)
-    return told, False
+    return lines, False
 
 
 def axostep_of_product(source: Path, out: Path, overwrite: bool) -> None:

@@ -25,8 +25,8 @@ _UNITS = {"micrometres": 1e3, "metres": 1e9, "angstrom": 0.1}
 def require_unit(states: StatesFile, columns: Mapping[str, str], angles: str | None) -> None:
     """Raise ImportFailed where the angles of an axis, or times, are probably in another unit than assumed."""
     for name, degrees in states.angles_deg.items():
-        known = np.unique(degrees[np.isfinite(degrees)])
-        turn = float(np.ptp(known)) if known.size else 0.0
+        finite = np.unique(degrees[np.isfinite(degrees)])
+        turn = float(np.ptp(finite)) if finite.size else 0.0
         unit = _unit_of(states, columns.get(name, columns.get(f"{name}_deg", name)))
         if angles == "radians" and np.deg2rad(turn) > 2 * MOST_RAD:
             raise ImportFailed(
@@ -40,7 +40,7 @@ def require_unit(states: StatesFile, columns: Mapping[str, str], angles: str | N
                 f"{states.path}: axis {name} turns by {turn:.6g} degrees, which is {turn / 360:.3g} turns. These "
                 "numbers are probably steps of a motor. Convert them to degrees, or add --angles degrees"
             )
-        small = known.size > 2 and turn <= MOST_RAD and np.diff(known).max() < STEP_DEG
+        small = finite.size > 2 and turn <= MOST_RAD and np.diff(finite).max() < STEP_DEG
         if small or _RADIANS.search(unit):
             why = f"{unit.strip()!r} says so" if _RADIANS.search(unit) else f"in steps below {STEP_DEG:g}"
             raise ImportFailed(

@@ -161,8 +161,8 @@ def frame_files(text: str) -> FrameFiles | None:
     elif _IN_NAME.search(folder.name) and not folder.exists():
         parts = _IN_NAME.split(folder.name)
         pattern = re.compile("".join(_NUMBER if k % 2 else re.escape(part) for k, part in enumerate(parts)))
-        found = folder.parent.iterdir() if folder.parent.is_dir() else ()
-        files = _naturally([f for f in found if pattern.fullmatch(f.name)])
+        entries = folder.parent.iterdir() if folder.parent.is_dir() else ()
+        files = _naturally([f for f in entries if pattern.fullmatch(f.name)])
         texts = [pattern.fullmatch(f.name).groups() for f in files]  # type: ignore[union-attr]
         numbers = {
             name: np.array([float(row[k].replace(",", ".")) for row in texts]) for k, name in enumerate(parts[1::2])
@@ -180,8 +180,8 @@ def _naturally(files: list[Path]) -> list[Path]:
 
 def missing_numbers(files: Sequence[Path]) -> str:
     """Numbers that the names of files leave out, as text; empty where the names are not numbered."""
-    found = [re.findall(r"\d{1,9}", f.stem) for f in files]
-    numbers = {int(n[-1]) for n in found if n}
+    digits = [re.findall(r"\d{1,9}", f.stem) for f in files]
+    numbers = {int(n[-1]) for n in digits if n}
     if len(numbers) < len(files) or max(numbers) - min(numbers) > 2 * len(files):
         return ""
     return ", ".join(str(n) for n in range(min(numbers), max(numbers)) if n not in numbers)
@@ -228,8 +228,8 @@ def _of_archive(file: Path, name: str) -> NDArray[Any]:
 
 def _require_array(file: Path, name: str, arrays: Sequence[str]) -> None:
     if name not in arrays:
-        asked = f"no array {name!r}; " if name else ""
-        raise ImportFailed(f"{file}: {asked}it has {_named(arrays)}. Choose one as {file}::NAME")
+        missing = f"no array {name!r}; " if name else ""
+        raise ImportFailed(f"{file}: {missing}it has {_named(arrays)}. Choose one as {file}::NAME")
 
 
 def _named(names: Sequence[str]) -> str:
@@ -237,20 +237,20 @@ def _named(names: Sequence[str]) -> str:
 
 
 def _datasets(h5: h5py.File, dimensions: int = 0) -> list[str]:
-    found: list[str] = []
+    names: list[str] = []
 
     def look(name: str, item: h5py.Dataset | h5py.Group) -> None:
         if isinstance(item, h5py.Dataset) and item.ndim >= dimensions:
-            found.append(f"/{name}")
+            names.append(f"/{name}")
 
     h5.visititems(look)
-    return found
+    return names
 
 
 def _only_stack(h5: h5py.File, file: str) -> str:
-    found = _datasets(h5, 3)
-    if len(found) != 1:
+    stacks = _datasets(h5, 3)
+    if len(stacks) != 1:
         raise ImportFailed(
-            f"{file}: datasets with three or four dimensions: {_named(found)}. Choose one as {file}::/NAME"
+            f"{file}: datasets with three or four dimensions: {_named(stacks)}. Choose one as {file}::/NAME"
         )
-    return found[0]
+    return stacks[0]

@@ -62,15 +62,15 @@ def states_of_stack(stack: str, channels: int) -> int:
 
 
 def require_one_source(request: ImportRequest, states: StatesFile, *, has_folder: bool) -> None:
-    given = {
+    sources = {
         "the column `file`": states.files is not None,
         "--stack": request.stack is not None and (states.files is None or not has_folder),
         "columns `channel_<name>`": bool(states.channels),
     }
-    ways = [name for name, present in given.items() if present]
+    ways = [name for name, present in sources.items() if present]
     if len(ways) != 1:
-        found = " and ".join(ways) or "none of them"
-        raise ImportFailed(f"{states.path}: frames come from exactly one of {', '.join(given)}; found {found}.")
+        text = " and ".join(ways) or "none of them"
+        raise ImportFailed(f"{states.path}: frames come from exactly one of {', '.join(sources)}; found {text}.")
 
 
 def _plain(name: str) -> str:

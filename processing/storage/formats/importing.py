@@ -62,8 +62,8 @@ def understand(request: ImportRequest) -> Understood:
     if request.instrument is not None:
         model = InstrumentModel.load(request.instrument)
         model.at(request.wavelength_nm)
-    found = frame_files(request.stack) if request.stack is not None else None
-    places = places_of(request.stack, found)
+    frames = frame_files(request.stack) if request.stack is not None else None
+    places = places_of(request.stack, frames)
     names = tuple(c.name for c in model.channels) if model and model.mosaic is None else ("camera",)
     if model is not None and model.beams and (places or (request.stack and dimensions_of(request.stack) == 3)):
         # Beams on one sensor: their images are cut apart when the capture is read.
@@ -77,7 +77,7 @@ def understand(request: ImportRequest) -> Understood:
         model.axes if model else (),
         request.columns,
         request.angles == "radians",
-        arrays=found.numbers if found else None,
+        arrays=frames.numbers if frames else None,
         count=count,
         source=request.stack or "frames",
     )
@@ -85,15 +85,15 @@ def understand(request: ImportRequest) -> Understood:
         states = replace(states, angles_deg={**states.angles_deg, NUMBER: np.arange(len(states), dtype=float)})
     require_unit(states, request.columns, request.angles)
     states = states.repeated(request.repeats)
-    require_one_source(request, states, has_folder=bool(places or found))
+    require_one_source(request, states, has_folder=bool(places or frames))
     if states.files is not None:
         folder = states.path.parent
-        if found is None:
+        if frames is None:
             places = tuple((folder / name, None) for name in states.files)
         else:
-            places = named_files(request, states, found)
-    elif found is not None:
-        require_order(request, states, found)
+            places = named_files(request, states, frames)
+    elif frames is not None:
+        require_order(request, states, frames)
     source = source_of(request, states, places, names, has_model=model is not None)
     if request.darks is not None:
         states, source = with_darks(request.darks, states, source)
@@ -108,8 +108,8 @@ def is_imported(request: ImportRequest) -> bool:
         header = capture.header
     if header.sample != request.sample or request.title not in ("", header.title):
         return False
-    made = request.out.stat().st_mtime_ns
-    return all(file.stat().st_mtime_ns < made for file in _files_of(request, understand(request)))
+    written_ns = request.out.stat().st_mtime_ns
+    return all(file.stat().st_mtime_ns < written_ns for file in _files_of(request, understand(request)))
 
 
 def _files_of(request: ImportRequest, understood: Understood) -> list[Path]:
@@ -117,8 +117,8 @@ def _files_of(request: ImportRequest, understood: Understood) -> list[Path]:
     texts = (request.stack, request.darks, request.states, request.instrument, *request.columns.values())
     files = [*understood.source.files]
     for text in map(str, filter(None, texts)):
-        found = frame_files(text) if text == request.darks else None
-        files += found.files if found else [Path(re.split(r"::|\[\d+\]$", text)[0])]
+        frames = frame_files(text) if text == request.darks else None
+        files += frames.files if frames else [Path(re.split(r"::|\[\d+\]$", text)[0])]
     return [file for file in files if file.is_file()]
 
 

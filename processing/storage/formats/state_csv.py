@@ -125,21 +125,21 @@ def read_states(
     ImportFailed : not readable, a column is missing, unknown or given twice, a number is none, a state is repeated.
     """
     mapping = {_axis_name(name): text for name, text in (columns or {}).items()}
-    known = {name: read_column(text) for name, text in mapping.items() if is_array(text)} | dict(arrays or {})
+    vectors = {name: read_column(text) for name, text in mapping.items() if is_array(text)} | dict(arrays or {})
     if path is not None:
         header, rows, units, delimiter = _table(
-            path, [text for name, text in mapping.items() if name not in known and text != IN_ORDER]
+            path, [text for name, text in mapping.items() if name not in vectors and text != IN_ORDER]
         )
     else:
-        header, rows, units, delimiter = [], _rows_without_table(known, count), {}, ","
+        header, rows, units, delimiter = [], _rows_without_table(vectors, count), {}, ","
     path = path or Path(next((t for t in mapping.values() if is_array(t)), source).partition("::")[0])
     ignored: dict[str, list[str]] = {}
     if mapping:
-        of_file = {n: t for n, t in mapping.items() if n not in known}
+        of_file = {n: t for n, t in mapping.items() if n not in vectors}
         header, rows, ignored = _mapped(path, header, rows, of_file, axes=axes)
     if "state" not in header:
         header, rows = ["state", *header], [(line, [str(k), *row]) for k, (line, row) in enumerate(rows)]
-    header, rows = _with_arrays(path, header, rows, known)
+    header, rows = _with_arrays(path, header, rows, vectors)
     names = [_axis_name(h) for h in header]
     _require_columns(path, header, names, axes)
     _check_names(path, names)
@@ -212,17 +212,17 @@ def _mapped(
     absent = [text for text in mapping.values() if text not in header]
     if absent:
         raise ImportFailed(f"{path}:1: no column {absent[0]!r}. Found: {', '.join(header)}")
-    kept, ignored = [], {}
+    columns, ignored = [], {}
     for k, h in enumerate(header):
         of_file = _axis_name(h) not in mapping and _is_known(h, _axis_name(h), axes)
         # One column may turn two axes.
         names = [name for name, text in mapping.items() if text == h]
         if not names and of_file and not (in_order and h == "state"):
             names = [h]
-        kept += [(k, name) for name in names]
+        columns += [(k, name) for name in names]
         if not names:
             ignored[h] = [row[k] for _, row in rows]
-    header, rows = [h for _, h in kept], [(line, [row[k] for k, _ in kept]) for line, row in rows]
+    header, rows = [h for _, h in columns], [(line, [row[k] for k, _ in columns]) for line, row in rows]
     if "state" not in header and not in_order and "file" not in header:
         _require_in_order(path, ignored)
     # An axis has the ending that tells it from a column that is not known.
@@ -265,11 +265,11 @@ def _table(path: Path, wanted: Sequence[str]) -> tuple[list[str], list[Row], dic
     header, rows, delimiter = _parsed(path, text_lines, first)
     if any(len(row) != len(header) for _, row in rows) or not set(wanted) <= set(header):
         # A log may begin with lines on the measurement: the header is the first that fits all rows after it.
-        for other in range(first + 1, min(first + MOST_LINES_BEFORE, len(text_lines))):
-            found = _parsed(path, text_lines, other)
-            fits = found[1] and all(len(row) == len(found[0]) for _, row in found[1]) and set(wanted) <= set(found[0])
-            if fits and not any(map(_is_number, found[0])) and (wanted or len(found[0]) > 1):
-                header, rows, delimiter = found
+        for start in range(first + 1, min(first + MOST_LINES_BEFORE, len(text_lines))):
+            table = _parsed(path, text_lines, start)
+            fits = table[1] and all(len(row) == len(table[0]) for _, row in table[1]) and set(wanted) <= set(table[0])
+            if fits and not any(map(_is_number, table[0])) and (wanted or len(table[0]) > 1):
+                header, rows, delimiter = table
                 break
     if header and all(_is_number(h) for h in header):
         raise ImportFailed(
@@ -328,9 +328,9 @@ def _require_columns(path: Path, header: list[str], names: list[str], axes: Sequ
     """Raise ImportFailed where a column is missing."""
     missing = [n for n in axes if n not in names]
     if missing:
-        found = one_line(", ".join(h for h in header if h != "state")) or "none"
+        heads = one_line(", ".join(h for h in header if h != "state")) or "none"
         raise ImportFailed(
-            f"{path}:1: no column {', '.join(missing)}. Found: {found}. Say which column has the angles of each axis: "
+            f"{path}:1: no column {', '.join(missing)}. Found: {heads}. Say which column has the angles of each axis: "
             + " ".join(f"--columns '{name}=COLUMN'" for name in missing)
         )
 
@@ -366,17 +366,17 @@ def _axis_name(header: str) -> str:
 
 
 def _order(path: Path, lines: list[int], states: list[str]) -> list[int]:
-    seen: dict[int, int] = {}
+    line_of: dict[int, int] = {}
     for line, text in zip(lines, states, strict=True):
         if not text.isascii() or not text.isdecimal() or len(text) > 9:
             raise ImportFailed(f"{path}:{line}: column state: {text!r} is not a whole number")
         number = int(text)
-        if number in seen:
-            raise ImportFailed(f"{path}:{line}: state {number} is given already in line {seen[number]}")
-        seen[number] = line
-    first, last = min(seen), max(seen)
-    if last - first + 1 != len(seen):
-        missing = next(number for number in range(first, last) if number not in seen)
+        if number in line_of:
+            raise ImportFailed(f"{path}:{line}: state {number} is given already in line {line_of[number]}")
+        line_of[number] = line
+    first, last = min(line_of), max(line_of)
+    if last - first + 1 != len(line_of):
+        missing = next(number for number in range(first, last) if number not in line_of)
         raise ImportFailed(
             f"{path}: state {missing} is missing between {first} and {last}. If it was not measured, add "
             f"--columns state={IN_ORDER}"

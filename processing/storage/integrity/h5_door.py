@@ -61,23 +61,23 @@ def _require_own(h5: h5py.File) -> None:
             except KeyError:
                 return None
             if isinstance(node, h5py.h5d.DatasetID):
-                made = node.get_create_plist()
-                if made.get_layout() == h5py.h5d.VIRTUAL or made.get_external_count():
+                creation = node.get_create_plist()
+                if creation.get_layout() == h5py.h5d.VIRTUAL or creation.get_external_count():
                     return f"{one_line(name.decode(errors='replace'))} lies in another file"
         elif link.type != h5py.h5l.TYPE_SOFT:
             place = name.decode(errors="replace")
-            other = h5.get(place, getlink=True)
-            of = f", {one_line(other.filename)}" if isinstance(other, h5py.ExternalLink) else ""
+            target = h5.get(place, getlink=True)
+            of = f", {one_line(target.filename)}" if isinstance(target, h5py.ExternalLink) else ""
             return f"{one_line(place)} is a link into another file{of}"
         return f"more than {MOST_LINKS:,} parts" if count > MOST_LINKS else None
 
     try:
-        found = h5.id.links.visit(look, info=True)
+        problem = h5.id.links.visit(look, info=True)
     except SystemError as why:
         # How h5py passes on what HDF5 says of damage below its callback.
         raise ValueError(str(why.__cause__ or why)) from why
-    if found is not None:
-        raise ValueError(found)
+    if problem is not None:
+        raise ValueError(problem)
 
 
 class OpenH5:
@@ -148,10 +148,10 @@ def require_dataset(parent: h5py.Group, name: str, shape: Sequence[int | None], 
     dataset = parent.get(name)
     if not isinstance(dataset, h5py.Dataset):
         raise ValueError(f"there is no dataset {name}")
-    found = dataset.shape or ()
-    if len(found) != len(shape) or any(want not in (None, got) for want, got in zip(shape, found, strict=True)):
-        wanted = " x ".join("any" if want is None else str(want) for want in shape) or "one value"
-        raise ValueError(f"{name} has the shape {found}, not {wanted}")
+    actual = dataset.shape or ()
+    if len(actual) != len(shape) or any(want not in (None, got) for want, got in zip(shape, actual, strict=True)):
+        expected = " x ".join("any" if want is None else str(want) for want in shape) or "one value"
+        raise ValueError(f"{name} has the shape {actual}, not {expected}")
     if dataset.dtype.kind not in kinds:
         raise ValueError(f"{name} holds {dataset.dtype}")
     if dataset.dtype.kind != "O" and dataset.size:

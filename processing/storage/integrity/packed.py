@@ -122,11 +122,11 @@ def _samples(shape: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], slice]]:
 
 def _byte_planes(block: NDArray[Any]) -> NDArray[np.uint8]:
     """The first bytes of all values, then all second bytes, ...: (bytes of a value, values)."""
-    whole = np.ascontiguousarray(block).reshape(-1).view(f"<u{block.itemsize}")
-    planes, shifted = np.empty((block.itemsize, block.size), np.uint8), np.empty_like(whole)
+    words = np.ascontiguousarray(block).reshape(-1).view(f"<u{block.itemsize}")
+    planes, shifted = np.empty((block.itemsize, block.size), np.uint8), np.empty_like(words)
     # Shifts and casts of whole numbers run in vector registers, copies of every n-th byte do not.
     for k, plane in enumerate(planes):
-        np.copyto(plane, np.right_shift(whole, 8 * k, out=shifted) if k else whole, casting="unsafe")
+        np.copyto(plane, np.right_shift(words, 8 * k, out=shifted) if k else words, casting="unsafe")
     return planes
 
 

@@ -91,7 +91,7 @@ def _unpacked(
     out = np.empty((*more, stop - start, columns), dtype=source.dtype)
 
     def fill(place: tuple[int, ...], top: int) -> None:
-        here = slice(max(start, top), min(stop, top + height))
+        part = slice(max(start, top), min(stop, top + height))
         index = (*first, *place, top, 0)
         block = None if kept is None else kept.get(index)
         if block is None:
@@ -99,9 +99,9 @@ def _unpacked(
             if skipped:
                 raise ValueError("a chunk that not every filter was used for")
             block = _values(isal_zlib.decompress(raw), source.dtype).reshape(height, columns)
-            if kept is not None and here.stop - here.start < height:
+            if kept is not None and part.stop - part.start < height:
                 kept.keep(index, block)
-        out[place][here.start - start : here.stop - start] = block[here.start - top : here.stop - top]
+        out[place][part.start - start : part.stop - start] = block[part.start - top : part.stop - top]
 
     chunks = list(_chunks(more, start // height * height, stop, height))
     threads = min(thread_count(), len(chunks))
@@ -122,7 +122,7 @@ def _chunks(more: tuple[int, ...], top: int, stop: int, height: int) -> Iterator
 def _values(shuffled: bytes, dtype: np.dtype[Any]) -> NDArray[Any]:
     """Values of which all first bytes, then all second bytes, ... stand together."""
     by_byte = np.frombuffer(shuffled, np.uint8).reshape(dtype.itemsize, -1)
-    whole = by_byte[0].astype(f"u{dtype.itemsize}")
+    words = by_byte[0].astype(f"u{dtype.itemsize}")
     for k, byte in enumerate(by_byte[1:], 1):
-        whole |= np.left_shift(byte, 8 * k, dtype=whole.dtype)
-    return np.asarray(whole.view(dtype))
+        words |= np.left_shift(byte, 8 * k, dtype=words.dtype)
+    return np.asarray(words.view(dtype))

@@ -21,14 +21,14 @@ def require_all_elements(product: Product) -> None:
     """Raise ProductError for the image of a partial polarimeter, which has no whole Mueller matrices."""
     product.require("mueller")
     if int(product.facts.get("rank", 16)) < 16:
-        rest = (
+        hint = (
             "With a model of the surface, `process xi0` and `process fit-material` take it."
             if "stokes" in product.names
             else "`process quantities` gives what follows from those that it has."
         )
         raise ProductError(
             f"{product.path} is of a partial polarimeter: it determines {product.facts.get('determined', 'less')}, and "
-            f"this needs all 16 elements. {rest}"
+            f"this needs all 16 elements. {hint}"
         )
 
 
@@ -140,8 +140,8 @@ class MuellerImage:
         """
 
         def root(values: NDArray[np.floating], *leading: int) -> NDArray[np.float32]:
-            found = np.sqrt(mean(np.square(values.reshape(*leading, -1))))
-            return found.astype(np.float32)[..., None]
+            rms = np.sqrt(mean(np.square(values.reshape(*leading, -1))))
+            return rms.astype(np.float32)[..., None]
 
         values = mean(self.values.reshape(4, 4, -1)).astype(np.float32)[..., None]
         mask = np.zeros(values.shape[2:], np.uint8)
@@ -185,8 +185,8 @@ class MuellerImage:
         full: NDArray[np.floating]
         if self.facts["weighted"]:
             normal = np.einsum("np,ni,nj->pij", 1 / self.intensity_variance, self.w, self.w, optimize=True)
-            whole = int(self.facts.get("rank", 16)) == 16
-            full = np.linalg.inv(normal) if whole else np.linalg.pinv(normal, rcond=SMALLEST**2, hermitian=True)
+            is_complete = int(self.facts.get("rank", 16)) == 16
+            full = np.linalg.inv(normal) if is_complete else np.linalg.pinv(normal, rcond=SMALLEST**2, hermitian=True)
             full = full + self.dark @ self.dark.T
         else:
             drive, variance = self._sources
@@ -224,9 +224,9 @@ class MuellerImage:
             full = self._covariance.reshape(-1, 16, 16)
             return np.asarray(np.einsum("pi,pi->p", (full @ g[:, :, None])[..., 0], g).reshape(self.mask.shape))
         drive, variance = self._sources
-        seen = drive.T @ g.T.astype(np.float32)
-        found = np.einsum("np,np,np->p", seen, seen, variance)
-        return np.asarray((found * self._told).reshape(self.mask.shape))
+        response = drive.T @ g.T.astype(np.float32)
+        total = np.einsum("np,np,np->p", response, response, variance)
+        return np.asarray((total * self._told).reshape(self.mask.shape))
 
     def covariance_with(self, gradient: NDArray[np.floating]) -> NDArray[np.float64]:
         """Covariance (rows, columns, 16) of the elements with a quantity of gradient (rows, columns, 16)."""
@@ -234,8 +234,8 @@ class MuellerImage:
         if self.facts["weighted"]:
             return np.asarray((self._covariance.reshape(-1, 16, 16) @ g[:, :, None]).reshape(gradient.shape))
         drive, variance = self._sources
-        found = drive @ (variance * (drive.T @ g.T.astype(np.float32)))
-        return np.asarray((found * self._told).T.reshape(gradient.shape), dtype=float)
+        covariance = drive @ (variance * (drive.T @ g.T.astype(np.float32)))
+        return np.asarray((covariance * self._told).T.reshape(gradient.shape), dtype=float)
 
     def covariances_between(self, pairs: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
         """Covariances (pairs, pixels) of elements, given by their numbers in row-major order; counts^2."""
@@ -259,8 +259,8 @@ class MuellerImage:
             return np.asarray(np.einsum("pk,pk->p", full, g).reshape(self.mask.shape))
         drive, variance = self._sources
         each = np.einsum("an,bn,abk->nk", drive, drive, form, optimize=True)
-        found = np.einsum("np,np->p", each.astype(np.float32) @ g.T.astype(np.float32), variance)
-        return np.asarray((found * self._told).reshape(self.mask.shape))
+        total = np.einsum("np,np->p", each.astype(np.float32) @ g.T.astype(np.float32), variance)
+        return np.asarray((total * self._told).reshape(self.mask.shape))
 
     def drawn_noise(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """One draw (16, pixels) of the noise of the elements, counts, with their covariance."""
@@ -280,12 +280,12 @@ class MuellerImage:
     @cached_property
     def _told(self) -> NDArray[np.float64]:
         # Flats and left-out states change all errors of a pixel much alike.
-        seen = self.seen
-        if not seen.any():
+        valid = self.seen
+        if not valid.any():
             return np.ones(self.mask.size)
         drive, variance = self._sources
-        plain = np.square(drive[seen]).sum(axis=0) @ variance
-        return np.asarray(np.square(self.errors.reshape(16, -1)[seen]).sum(axis=0) / plain)
+        plain = np.square(drive[valid]).sum(axis=0) @ variance
+        return np.asarray(np.square(self.errors.reshape(16, -1)[valid]).sum(axis=0) / plain)
 
     @cached_property
     def _sources(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -316,10 +316,8 @@ def difference_errors(images: Sequence[MuellerImage], gradients: Sequence[NDArra
     first, second = images
     if len(first.w) != len(second.w) or first.facts["weighted"] or second.facts["weighted"]:
         return np.full(first.mask.shape, np.nan)
-    one, other = (
-        image._inverse.T @ gradient.reshape(-1, 16).T for image, gradient in zip(images, gradients, strict=True)
-    )
-    apart = np.einsum("np,np->p", np.square(one - other), first.told_variance)
+    a, b = (image._inverse.T @ gradient.reshape(-1, 16).T for image, gradient in zip(images, gradients, strict=True))
+    apart = np.einsum("np,np->p", np.square(a - b), first.told_variance)
     return np.asarray(np.sqrt(apart).reshape(first.mask.shape))
 
 

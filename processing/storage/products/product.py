@@ -233,10 +233,10 @@ class ProductWriter(OpenH5):
         size = self._partial.stat().st_size
         if os.environ.get(COMPRESS_VARIABLE) == "0" or shutil.disk_usage(self._partial.parent).free < size:
             return None
-        whole = self._h5["entry"]
-        every = {name: Packing.of(plane) for name, plane in whole["data"].items() if name in self.planes}
+        source = self._h5["entry"]
+        every = {name: Packing.of(plane) for name, plane in source["data"].items() if name in self.planes}
         packings = {name: packing for name, packing in every.items() if packing.is_worth_it}
-        saved = sum(whole["data"][name].nbytes * (1 - 1 / packing.ratio) for name, packing in packings.items())
+        saved = sum(source["data"][name].nbytes * (1 - 1 / packing.ratio) for name, packing in packings.items())
         if saved < WORTH_SAVING * size:
             return None
 
@@ -249,14 +249,14 @@ class ProductWriter(OpenH5):
             entry = h5["entry"]
             for name in self.planes:
                 if name in packings:
-                    pack(whole["data"][name], entry["data"][name], packings[name])
+                    pack(source["data"][name], entry["data"][name], packings[name])
                 else:
-                    entry["data"][name][...] = whole["data"][name][...]
-            for name, there in whole.get("reduction", {}).items():
-                if not there.is_scale:
-                    _add_array(entry, name, there[()], {key: there.attrs[key] for key in ("units", "long_name")})
-            entry["rows_done"][...] = whole["rows_done"][()]
-            entry.attrs["facts_json"] = whole.attrs["facts_json"]
+                    entry["data"][name][...] = source["data"][name][...]
+            for name, array in source.get("reduction", {}).items():
+                if not array.is_scale:
+                    _add_array(entry, name, array[()], {key: array.attrs[key] for key in ("units", "long_name")})
+            entry["rows_done"][...] = source["rows_done"][()]
+            entry.attrs["facts_json"] = source.attrs["facts_json"]
         return path
 
 

@@ -68,9 +68,9 @@ def file_identity(path: Path, role: str = "") -> dict[str, Any]:
     """
     size = require_file(path)
     identity = {"role": role, "path": str(path.resolve()), "bytes": size}
-    known = made_of(path)
-    if known is not None:
-        return identity | {MADE_OF: known}
+    mark = made_of(path)
+    if mark is not None:
+        return identity | {MADE_OF: mark}
     summed = without_frames_sha256(path)
     if summed is not None:
         return identity | {"sha256_without_frames": summed}
@@ -85,8 +85,8 @@ def content_of(identity: Mapping[str, Any]) -> str | None:
 
 def made_of(path: Path) -> str | None:
     """`Step.made_of` of a product; None for a file that is not there, or does not say."""
-    found = mark_of(path, MADE_OF)
-    return None if found is None else str(found)
+    mark = mark_of(path, MADE_OF)
+    return None if mark is None else str(mark)
 
 
 def sign(h5: h5py.File, steps: Sequence[Step]) -> None:
@@ -136,8 +136,8 @@ def steps_text(steps: Sequence[Step]) -> str:
     """Lines for people: each step with the arguments that were given, and its inputs."""
     lines = []
     for step in steps:
-        given = ", ".join(f"{k}={v}" for k, v in step.arguments.items() if v is not None)
-        lines += [f"{step.date} {step.program}: {step.name}({given})"]
+        arguments = ", ".join(f"{k}={v}" for k, v in step.arguments.items() if v is not None)
+        lines += [f"{step.date} {step.program}: {step.name}({arguments})"]
         lines += [f"    from {input_text(identity)}" for identity in step.inputs]
     return "\n".join(lines)
 
