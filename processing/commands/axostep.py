@@ -36,8 +36,8 @@ def from_axostep_command(
         facts, is_unchanged = product_of_axostep(source, target, wavelength_nm, omega_deg, overwrite=overwrite)
         return Made((target,), is_unchanged, "".join(f"  {fact}" for fact in facts))
 
-    def print_result(made: Made) -> None:
-        typer.echo(f"{made.facts.strip()}\n{made.paths[0]}")
+    def print_result(output: Made) -> None:
+        typer.echo(f"{output.facts.strip()}\n{output.paths[0]}")
 
     run_batch("reading", "files", inputs, make, print_result=print_result)
 

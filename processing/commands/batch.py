@@ -30,7 +30,7 @@ class Made(NamedTuple):
 
 
 def run_batch(
-    what: str,
+    action: str,
     unit: str,
     inputs: Sequence[Path],
     make: Callable[[Path, Progress], Made],
@@ -45,7 +45,7 @@ def run_batch(
 
     Parameters
     ----------
-    what, unit
+    action, unit
         Words of the progress bar: "reducing", "rows".
     inputs
         Files, see `files_of`.
@@ -60,7 +60,7 @@ def run_batch(
     typer.Exit : one of several failed.
     """
     if len(inputs) == 1:
-        with progress_bar(what, unit) as tick:
+        with progress_bar(action, unit) as tick:
             output = make(inputs[0], tick)
         if print_result is None:
             typer.echo("\n".join(map(str, output.paths)))
@@ -72,7 +72,7 @@ def run_batch(
     counts = {word: 0, "unchanged": 0, "failed": 0}
     failures: list[str] = []
     worst = 0
-    with batch_bar(what, len(inputs)) as bar:
+    with batch_bar(action, len(inputs)) as bar:
         for path in inputs:
             try:
                 output = make(path, bar.tick)
@@ -94,7 +94,7 @@ def run_batch(
 
 
 def make_products(
-    what: str,
+    action: str,
     unit: str,
     inputs: Sequence[Path],
     step_of: Callable[[Path, Progress], tuple[FileStep, Found | None]],
@@ -138,13 +138,13 @@ def make_products(
             draw(product.path, None, no_figure, silent=True)
         return Made((product.path,), product.was_there, one_line(product.path))
 
-    def print_result(made: Made) -> None:
+    def print_result(output: Made) -> None:
         for start in first:
             typer.echo(f"using {start.path}") if start.was_there else summary(start.path)
-        summary(made.paths[0])
-        draw(made.paths[0], figure, no_figure)
+        summary(output.paths[0])
+        draw(output.paths[0], figure, no_figure)
 
-    run_batch(what, unit, inputs, make, print_result=print_result)
+    run_batch(action, unit, inputs, make, print_result=print_result)
 
 
 def place_for(inputs: Sequence[Path], out: Path | None) -> Callable[[Path], Path]:
@@ -195,7 +195,7 @@ def written_if_changed(target: Path, overwrite: bool, write: Callable[[Path], Se
 
 
 def files_of(
-    sources: Sequence[Path], takes: Callable[[Path], bool], what: str, endings: Sequence[str] = (".h5",)
+    sources: Sequence[Path], takes: Callable[[Path], bool], text: str, endings: Sequence[str] = (".h5",)
 ) -> list[Path]:
     """Files that are given, and those under folders that are given, in natural order (2 before 10), each once.
 
@@ -204,7 +204,7 @@ def files_of(
     takes
         Whether the command is for a file; asked of those in folders. One that cannot be read is taken as well: the
         command then reports it.
-    what
+    text
         What it is for, for the message where a folder holds nothing of it: "captures".
 
     Raises
@@ -219,7 +219,7 @@ def files_of(
         inside = [p for ending in endings for p in source.rglob(f"*{ending}") if p.is_file() and _shown(p, source)]
         selection = [p for p in sorted(inside, key=natural) if _takes(takes, p)]
         if not selection:
-            raise ProcessError(f"{source} holds no {what}. Give files, or the folder that they are in.")
+            raise ProcessError(f"{source} holds no {text}. Give files, or the folder that they are in.")
         files += selection
     return list({os.path.realpath(path): path for path in files}.values())
 

@@ -119,7 +119,7 @@ def _show_comparison(result: CampaignResult, title: str, target: Path, with_pape
 
 
 def _show_means(
-    points: Sequence[CurvePoint], wanted: list[str] | None, title: str, target: Path, *, simulated: bool
+    points: Sequence[CurvePoint], quantities: list[str] | None, title: str, target: Path, *, simulated: bool
 ) -> None:
     from processing.errors import ProcessError
     from processing.reports.reflectance_figures import CURVES, curves_figure
@@ -136,13 +136,13 @@ def _show_means(
         return
     rows = [row for point in points for row in point.rows]
     names = {row["quantity"] for row in rows}
-    if unknown := [name for name in wanted or () if name not in names]:
+    if unknown := [name for name in quantities or () if name not in names]:
         raise ProcessError(f"--quantity {unknown[0]}: no such quantity. There are: {', '.join(sorted(names))}")
     write_rows(target / "means.csv", rows)
     # Air stands at another angle than the samples, and has its rows in the table.
     drawn = [row for point in points if not point.capture.is_reference for row in point.rows] or rows
     names = {row["quantity"] for row in drawn}
-    shown = [name for name in wanted or CURVES if name in names][: None if wanted else 6]
+    shown = [name for name in quantities or CURVES if name in names][: None if quantities else 6]
     with whole_file(target / "means.png") as new:
         curves_figure(drawn, shown, title, simulated).savefig(new, dpi=150)
     typer.echo(str(target / "means.csv"))

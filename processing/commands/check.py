@@ -49,8 +49,8 @@ def check_command(
         table = keep(change, reference)
         return Made((capture if several else table,), several and not change.count, f"  {top.name} by {top.value:+.2g}")
 
-    def print_result(made: Made) -> None:
-        (change,), (table,) = changes.values(), made.paths
+    def print_result(output: Made) -> None:
+        (change,), (table,) = changes.values(), output.paths
         _print_change(change, reference, tolerance)
         typer.echo(f"{table}\n{table.with_suffix('.png')}")
 
@@ -70,15 +70,15 @@ def check_command(
         raise typer.Exit(1)
 
 
-def _print_change(found: Change, reference: Path, tolerance: float) -> None:
-    if found.simulated:
+def _print_change(change: Change, reference: Path, tolerance: float) -> None:
+    if change.simulated:
         typer.echo("SIMULATED data")
-    typer.echo(f"{'changed' if found.count else 'unchanged'} since {reference.name}")
-    typer.echo(f"  light: {100 * found.light.value:+.2f} +- {100 * found.light.error:.2g} %")
-    largest, (rows, columns) = found.largest, found.largest.region
+    typer.echo(f"{'changed' if change.count else 'unchanged'} since {reference.name}")
+    typer.echo(f"  light: {100 * change.light.value:+.2f} +- {100 * change.light.error:.2g} %")
+    largest, (rows, columns) = change.largest, change.largest.region
     place = f"rows {rows.start}:{rows.stop}, columns {columns.start}:{columns.stop}"
     typer.echo(f"  largest change over m00: {largest.name} by {largest.value:+.2g} +- {largest.error:.1g} in {place}")
-    typer.echo(f"  {found.count} of {found.tests} comparisons beyond noise and the tolerance of {tolerance:g}")
+    typer.echo(f"  {change.count} of {change.tests} comparisons beyond noise and the tolerance of {tolerance:g}")
 
 
 def _name_cause(capture: Path, reference: Path, instrument: Path | None) -> None:

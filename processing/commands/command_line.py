@@ -29,8 +29,8 @@ def shown(text: object) -> str:
     return CONTROL.sub(lambda match: match[0] if match[0] in "\n\t" else ascii(match[0])[1:-1], str(text))
 
 
-def _tell_version(wanted: bool) -> None:
-    if wanted:
+def _tell_version(is_requested: bool) -> None:
+    if is_requested:
         typer.echo(f"umov {version('umov')}")
         raise typer.Exit()
 

@@ -184,14 +184,14 @@ def _optimized(
     return designs[-1].table((str(generator.axis), str(analyzer.axis)))
 
 
-def _show(title: str, found: Score, noise: AssumedNoise) -> None:
+def _show(title: str, result: Score, noise: AssumedNoise) -> None:
     typer.echo(title)
-    typer.echo(f"  rank {found.rank} of {found.wanted}, condition number {found.condition_number:.4g}")
+    typer.echo(f"  rank {result.rank} of {result.wanted}, condition number {result.condition_number:.4g}")
     typer.echo(
-        f"  equally weighted variance {found.equally_weighted_variance:.4g}; the bound for {found.intensities} "
-        f"intensities is {found.bound:.4g}"
+        f"  equally weighted variance {result.equally_weighted_variance:.4g}; the bound for {result.intensities} "
+        f"intensities is {result.bound:.4g}"
     )
-    if found.rank < found.wanted:
+    if result.rank < result.wanted:
         typer.echo(
             "  these states do not determine all that the instrument can: take another ratio, or less regular steps"
         )
@@ -200,7 +200,7 @@ def _show(title: str, found: Score, noise: AssumedNoise) -> None:
         f"  standard errors of m_ij / m00, an ideal depolarizer at {noise.electrons:g} electrons a state, read noise "
         f"{noise.read_noise_e:g}:"
     )
-    for row in found.element_stderr:
+    for row in result.element_stderr:
         typer.echo("    " + "  ".join(f"{value:.5f}" if value == value else "   -   " for value in row))
 
 

@@ -157,10 +157,10 @@ def import_command(
     run_batch("importing", "states", list(requests), make, print_result=_print_imported)
 
 
-def _print_imported(made: Made) -> None:
+def _print_imported(output: Made) -> None:
     from processing.storage.captures.capture import Capture
 
-    (path,) = made.paths
+    (path,) = output.paths
     with Capture(path) as capture:
         header = capture.header
         count = 0 if capture.angles_deg else capture.states_with("sample").size

@@ -82,23 +82,23 @@ def mean_command(
         typer.echo(str(out))
 
 
-def _print_means(found: Sequence[MeanValue]) -> None:
+def _print_means(means: Sequence[MeanValue]) -> None:
     head = ("quantity", "value", "u noise", "u instrument", "scatter", "dof", "interval")
     typer.echo("{:38} {:>11} {:>9} {:>12} {:>9} {:>6}  {}".format(*head))
-    for mean in found:
+    for mean in means:
         typer.echo(
             f"{mean.name:38} {mean.value:11.5g} {mean.u_noise:9.2g} {mean.u_systematic:12.2g} {mean.scatter:9.2g} "
             f"{mean.degrees_of_freedom:6.3g}  {mean.low:.5g} to {mean.high:.5g} {mean.unit}"
         )
 
 
-def _print_budget(found: Sequence[MeanValue], name: str) -> None:
+def _print_budget(means: Sequence[MeanValue], name: str) -> None:
     from processing.errors import ProcessError
     from processing.maps.means import BUDGET_COLUMNS
 
-    mean = next((value for value in found if value.name == name), None)
+    mean = next((value for value in means if value.name == name), None)
     if mean is None:
-        raise ProcessError(f"--budget {name}: no such quantity. Choose one of: {', '.join(v.name for v in found)}")
+        raise ProcessError(f"--budget {name}: no such quantity. Choose one of: {', '.join(v.name for v in means)}")
     typer.echo(f"{mean.name} = {mean.value:.6g} {mean.unit}")
     for line in (BUDGET_COLUMNS, *mean.budget_lines):
         typer.echo("  {:50} {:>9} {:>11} {:>12} {:>7} {:>5}".format(*line))

@@ -36,30 +36,30 @@ class BatchBar:
 
 
 @contextmanager
-def progress_bar(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+def progress_bar(title: str, unit: str) -> Iterator[Callable[[int, int], None]]:
     """A bar on stderr, gone at the end; yields a function of (done, in all). Nothing is drawn off a terminal."""
     from rich.progress import MofNCompleteColumn, TextColumn
 
-    with _bar(what, MofNCompleteColumn(), TextColumn(unit)) as bar:
-        task = bar.add_task(what, total=None)
+    with _bar(title, MofNCompleteColumn(), TextColumn(unit)) as bar:
+        task = bar.add_task(title, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 @contextmanager
-def batch_bar(what: str, inputs: int) -> Iterator[BatchBar]:
+def batch_bar(title: str, inputs: int) -> Iterator[BatchBar]:
     """A bar over `inputs` files, as `progress_bar`."""
     from rich.progress import TextColumn
 
-    with _bar(what, TextColumn("{task.completed:.0f}/{task.total:.0f} files")) as bar:
+    with _bar(title, TextColumn("{task.completed:.0f}/{task.total:.0f} files")) as bar:
         yield BatchBar(bar, inputs)
 
 
 @contextmanager
-def _bar(what: str, *counts: object) -> Iterator[Progress]:
+def _bar(title: str, *counts: object) -> Iterator[Progress]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn(what, markup=False), BarColumn(), *counts, TimeRemainingColumn())
+    columns = (TextColumn(title, markup=False), BarColumn(), *counts, TimeRemainingColumn())
     console = Console(stderr=True)
 
     def compiling() -> None:
@@ -77,7 +77,7 @@ def _bar(what: str, *counts: object) -> Iterator[Progress]:
 
 
 @contextmanager
-def progress_line(what: str, verbose: bool) -> Iterator[Callable[[str], None]]:
+def progress_line(title: str, verbose: bool) -> Iterator[Callable[[str], None]]:
     """One line on stderr with the present step and the seconds so far; yields a function of the step.
 
     `verbose`: every step stays, on a line of its own. Off a terminal nothing is drawn without it.
@@ -88,7 +88,7 @@ def progress_line(what: str, verbose: bool) -> Iterator[Callable[[str], None]]:
     console = Console(stderr=True)
     columns = (
         SpinnerColumn(),
-        TextColumn(what, markup=False),
+        TextColumn(title, markup=False),
         TimeElapsedColumn(),
         TextColumn("{task.description}", markup=False),
     )
@@ -97,7 +97,7 @@ def progress_line(what: str, verbose: bool) -> Iterator[Callable[[str], None]]:
 
         def say(step: str) -> None:
             # Within the line: a broken one is not taken away at the end.
-            progress.update(task, description=step[: max(console.width - len(what) - 14, 0)])
+            progress.update(task, description=step[: max(console.width - len(title) - 14, 0)])
             if verbose:
                 console.print(step, soft_wrap=True, markup=False, highlight=False)
 

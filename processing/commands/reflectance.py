@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from processing.steps.file_step import FileStep, Found, Progress
 
 
-def design_stokes(geometry: Path, material: Path, camera: Path, given: Assumptions, *, figure: Path) -> None:
+def design_stokes(geometry: Path, material: Path, camera: Path, scene: Assumptions, *, figure: Path) -> None:
     """Recommend the illumination of a Stokes capture from the standard error of xi0 that it predicts."""
     from processing.calibration.illumination_design import linear_states, predict
     from processing.commands.progress_bar import progress_bar
@@ -32,7 +32,7 @@ def design_stokes(geometry: Path, material: Path, camera: Path, given: Assumptio
     ranked = {}
     for nm in model.wavelengths_nm:
         with progress_bar(f"{nm:g} nm", "angles") as tick:
-            ranked[nm] = predict(view, model, nm, instrument, states=linear_states(), assumptions=given, progress=tick)
+            ranked[nm] = predict(view, model, nm, instrument, states=linear_states(), assumptions=scene, progress=tick)
         typer.echo(f"{nm:g} nm   standard error of xi0 over the object and Omega 20 to 90 degrees")
         for p in ranked[nm]:
             worst = int(p.median.argmax())

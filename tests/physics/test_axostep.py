@@ -64,7 +64,7 @@ def test_mueller_image_byte_by_byte(tmp_path: Path) -> None:
         assert image.metadata == numbers
         assert image.date is not None
         assert (image.date - datetime(1904, 1, 1, tzinfo=UTC)).total_seconds() == seconds
-        assert image.rest == b"\x00\x01\x02\x03"
+        assert image.trailer == b"\x00\x01\x02\x03"
         again = tmp_path / "b.cmmi"
         write_mueller_file(again, image)
         assert again.read_bytes() == file.read_bytes()

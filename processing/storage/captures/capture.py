@@ -139,9 +139,9 @@ class Capture(OpenH5):
             if k in self._contradictory or not self._rows_agree(k, slice(None), self._frames[int(self.done[k])])
         ]
 
-    def _changed(self, state: int, what: str) -> CaptureError:
+    def _changed(self, state: int, part: str) -> CaptureError:
         return CaptureError(
-            f"{self.path}: state {self.done[state]} was changed on the disc, {what} and the checksum differ. Take the "
+            f"{self.path}: state {self.done[state]} was changed on the disc, {part} and the checksum differ. Take the "
             "file from a copy; `acquire verify` tells what else is damaged."
         )
 

@@ -92,7 +92,7 @@ class MuellerFile:
     reduced : (K, rows, columns) float32, AxoStep's own reduced parameters; K = 0 in a .bmmi file.
     metadata : number by name of `METADATA`, without the date; as many as the file holds.
     date : of the measurement; None if the file holds none.
-    rest : words after the known metadata, as they were.
+    trailer : words after the known metadata, as they were.
     header_words : 4 as in the format sheet, 5 as the lab's reader expects; in the latter, `header` is word 0.
     """
 
@@ -100,7 +100,7 @@ class MuellerFile:
     reduced: NDArray[np.float32]
     metadata: dict[str, float] = field(default_factory=dict)
     date: datetime | None = None
-    rest: bytes = b""
+    trailer: bytes = b""
     header_words: int = 5
     header: float = 0.0
 
@@ -208,4 +208,4 @@ def _metadata_bytes(image: MuellerFile) -> bytes:
             out += struct.pack(">d", seconds)
         else:
             out += struct.pack(">f", image.metadata.get(name, 0.0))
-    return out + image.rest
+    return out + image.trailer

@@ -40,10 +40,10 @@ class FrameSource:
 Place = tuple[Path, int | None]
 
 
-def places_of(stack: str | None, found: FrameFiles | None) -> tuple[Place, ...]:
+def places_of(stack: str | None, frames: FrameFiles | None) -> tuple[Place, ...]:
     """Frames of a folder, a picture, or the pages of a picture; empty for other stacks."""
-    if stack is None or found is not None:
-        return tuple((file, None) for file in found.files) if found else ()
+    if stack is None or frames is not None:
+        return tuple((file, None) for file in frames.files) if frames else ()
     file = Path(stack)
     if file.suffix.lower() not in (*PAGED, ".png"):
         return ()
@@ -78,9 +78,9 @@ def _plain(name: str) -> str:
     return name.replace("\\", "/").rpartition("/")[2]
 
 
-def named_files(request: ImportRequest, states: StatesFile, found: FrameFiles) -> tuple[Place, ...]:
+def named_files(request: ImportRequest, states: StatesFile, frames: FrameFiles) -> tuple[Place, ...]:
     """The files of a folder that a column of the table names, with their ending or without."""
-    of_name = {file.stem: file for file in found.files} | {file.name: file for file in found.files}
+    of_name = {file.stem: file for file in frames.files} | {file.name: file for file in frames.files}
     absent = [(line, n) for line, n in zip(states.line, states.files or (), strict=True) if _plain(n) not in of_name]
     if absent:
         line, name = absent[0]
@@ -88,24 +88,24 @@ def named_files(request: ImportRequest, states: StatesFile, found: FrameFiles) -
     return tuple((of_name[_plain(name)], None) for name in states.files or ())
 
 
-def require_order(request: ImportRequest, states: StatesFile, found: FrameFiles) -> None:
+def require_order(request: ImportRequest, states: StatesFile, frames: FrameFiles) -> None:
     """Raise ImportFailed where there is not a frame for each state, or a column names the files in another order."""
-    names = {file.name for file in found.files} | {file.stem for file in found.files}
+    names = {file.name for file in frames.files} | {file.stem for file in frames.files}
     for column, cells in states.ignored.items():
         plain = [_plain(cell) for cell in cells]
         if set(plain) <= names and len(set(plain)) == len(plain):
-            in_order = [n in (f.name, f.stem) for n, f in zip(plain, found.files, strict=False)]
-            if not all(in_order) or len(in_order) != len(found.files):
+            in_order = [n in (f.name, f.stem) for n, f in zip(plain, frames.files, strict=False)]
+            if not all(in_order) or len(in_order) != len(frames.files):
                 raise ImportFailed(
                     f"{states.path}: column {column!r} names the frames of {request.stack} in an order of its own, or "
                     f"not all of them. Add --columns 'file={column}'"
                 )
-    if len(found.files) != len(states):
-        gap = missing_numbers(found.files)
+    if len(frames.files) != len(states):
+        gap = missing_numbers(frames.files)
         numbers = f"; their names leave out {one_line(gap, 60)}" if gap else ""
-        often, more = divmod(len(found.files), len(states))
+        often, more = divmod(len(frames.files), len(states))
         raise ImportFailed(
-            f"{request.stack}: {len(found.files)} frames for {len(states)} states of {states.path}{numbers}. "
+            f"{request.stack}: {len(frames.files)} frames for {len(states)} states of {states.path}{numbers}. "
             + (f"If each state has {often} frames, one after the other, add --repeats {often}. " if not more else "")
             + "Choose frames by a pattern, as --stack 'FOLDER/img_*.tif', or by a column of the table: --columns "
             "file=COLUMN"

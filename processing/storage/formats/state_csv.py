@@ -191,10 +191,10 @@ def read_states(
     )
 
 
-def _rows_without_table(known: Mapping[str, NDArray[np.float64]], count: int | None) -> list[Row]:
+def _rows_without_table(vectors: Mapping[str, NDArray[np.float64]], count: int | None) -> list[Row]:
     """Rows without columns, one for each number of the first array, or `count`."""
-    if known:
-        count = len(next(iter(known.values())))
+    if vectors:
+        count = len(next(iter(vectors.values())))
     if count is None:
         raise ImportFailed(
             "no states: give --states FILE.csv, the angles of each axis as --columns AXIS=FILE::NAME, or frames that "
@@ -254,7 +254,7 @@ def _with_arrays(
     return header, rows
 
 
-def _table(path: Path, wanted: Sequence[str]) -> tuple[list[str], list[Row], dict[str, str], str]:
+def _table(path: Path, required: Sequence[str]) -> tuple[list[str], list[Row], dict[str, str], str]:
     """Header, rows with their line numbers, units that stand in a line of their own, and the delimiter."""
     text_lines = read_text_of_any_system(path, ImportFailed).splitlines(keepends=True)
     first = next((k for k, line in enumerate(text_lines) if line.strip() and not line.startswith("#")), 0)
@@ -263,12 +263,12 @@ def _table(path: Path, wanted: Sequence[str]) -> tuple[list[str], list[Row], dic
         first -= 1
         text_lines[first] = text_lines[first].lstrip("# ")
     header, rows, delimiter = _parsed(path, text_lines, first)
-    if any(len(row) != len(header) for _, row in rows) or not set(wanted) <= set(header):
+    if any(len(row) != len(header) for _, row in rows) or not set(required) <= set(header):
         # A log may begin with lines on the measurement: the header is the first that fits all rows after it.
         for start in range(first + 1, min(first + MOST_LINES_BEFORE, len(text_lines))):
             table = _parsed(path, text_lines, start)
-            fits = table[1] and all(len(row) == len(table[0]) for _, row in table[1]) and set(wanted) <= set(table[0])
-            if fits and not any(map(_is_number, table[0])) and (wanted or len(table[0]) > 1):
+            fits = table[1] and all(len(row) == len(table[0]) for _, row in table[1]) and set(required) <= set(table[0])
+            if fits and not any(map(_is_number, table[0])) and (required or len(table[0]) > 1):
                 header, rows, delimiter = table
                 break
     if header and all(_is_number(h) for h in header):

@@ -111,21 +111,21 @@ def mark_of(path: Path, name: str) -> Any:
 
 
 @contextmanager
-def damage_as(error: type[ProcessError], what: str) -> Iterator[None]:
-    """Damage found while reading becomes `error`: one line that starts with `what`."""
+def damage_as(error: type[ProcessError], text: str) -> Iterator[None]:
+    """Damage found while reading becomes `error`: one line that starts with `text`."""
     try:
         yield
     except ProcessError:
         raise
     except DAMAGE as why:
-        raise error(f"{what} ({one_line(why)})") from why
+        raise error(f"{text} ({one_line(why)})") from why
 
 
 @contextmanager
-def closed_if_damaged(h5: h5py.File, error: type[ProcessError], what: str) -> Iterator[None]:
+def closed_if_damaged(h5: h5py.File, error: type[ProcessError], text: str) -> Iterator[None]:
     """The same while a file is read for the first time; it does not stay open then."""
     try:
-        with damage_as(error, what):
+        with damage_as(error, text):
             yield
     except error:
         h5.close()

@@ -52,13 +52,13 @@ class KeptChunks:
 
 
 def read_rows(
-    source: h5py.Dataset, rows: slice, first: tuple[int, ...] = (), kept: KeptChunks | None = None
+    source: h5py.Dataset, rows: slice, first: tuple[int, ...] = (), cache: KeptChunks | None = None
 ) -> NDArray[Any]:
     """Rows of a dataset (first..., more..., rows, columns), as `source[*first, ..., rows, :]`.
 
     Parameters
     ----------
-    kept : chunks of this dataset that earlier calls have unpacked; this one adds its own.
+    cache : chunks of this dataset that earlier calls have unpacked; this one adds its own.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def read_rows(
     start, stop, step = rows.indices(source.shape[-2])
     if step == 1 and stop > start and is_packed(source):
         try:
-            return _unpacked(source, start, stop, first, kept=kept)
+            return _unpacked(source, start, stop, first, cache=cache)
         except (OSError, ValueError, RuntimeError, DAMAGED):
             # A chunk that was never written, is not packed, or is damaged.
             pass
@@ -85,7 +85,7 @@ def is_packed(source: h5py.Dataset) -> bool:
 
 
 def _unpacked(
-    source: h5py.Dataset, start: int, stop: int, first: tuple[int, ...], *, kept: KeptChunks | None
+    source: h5py.Dataset, start: int, stop: int, first: tuple[int, ...], *, cache: KeptChunks | None
 ) -> NDArray[Any]:
     more, columns, height = source.shape[len(first) : -2], source.shape[-1], source.chunks[-2]
     out = np.empty((*more, stop - start, columns), dtype=source.dtype)
@@ -93,14 +93,14 @@ def _unpacked(
     def fill(place: tuple[int, ...], top: int) -> None:
         part = slice(max(start, top), min(stop, top + height))
         index = (*first, *place, top, 0)
-        block = None if kept is None else kept.get(index)
+        block = None if cache is None else cache.get(index)
         if block is None:
             skipped, raw = source.id.read_direct_chunk(index)
             if skipped:
                 raise ValueError("a chunk that not every filter was used for")
             block = _values(isal_zlib.decompress(raw), source.dtype).reshape(height, columns)
-            if kept is not None and part.stop - part.start < height:
-                kept.keep(index, block)
+            if cache is not None and part.stop - part.start < height:
+                cache.keep(index, block)
         out[place][part.start - start : part.stop - start] = block[part.start - top : part.stop - top]
 
     chunks = list(_chunks(more, start // height * height, stop, height))

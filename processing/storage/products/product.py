@@ -329,7 +329,7 @@ class Product(OpenH5):
         """Dataset (leading..., rows, columns)."""
         dataset = self._dataset(name)
         with damage_as(ProductError, f"{self.path} is damaged"):
-            return read_rows(dataset, rows, kept=self._kept[name])
+            return read_rows(dataset, rows, cache=self._kept[name])
 
     def units(self, name: str) -> str:
         """Unit of a dataset."""
