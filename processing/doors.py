@@ -45,19 +45,19 @@ def require_file(
         Of the class `error`: it is not there, no regular file, or larger than `most_bytes`.
     """
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except (OSError, ValueError) as why:
         raise error(f"{one_line(path)}: cannot be read ({getattr(why, 'strerror', why)})") from why
-    if not stat.S_ISREG(found.st_mode):
-        what = "a folder, and a file is asked for" if stat.S_ISDIR(found.st_mode) else "no regular file"
-        raise error(f"{path}: is {what}")
-    if most_bytes is not None and found.st_size > most_bytes:
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder, and a file is asked for" if stat.S_ISDIR(status.st_mode) else "no regular file"
+        raise error(f"{path}: is {kind}")
+    if most_bytes is not None and status.st_size > most_bytes:
         raise error(
-            f"{path}: has {found.st_size:,} bytes, a file of this kind at most {most_bytes:,}. Is it the right one?"
+            f"{path}: has {status.st_size:,} bytes, a file of this kind at most {most_bytes:,}. Is it the right one?"
         )
-    if found.st_size == 0 and not may_be_empty:
+    if status.st_size == 0 and not may_be_empty:
         raise error(f"{one_line(path)}: cannot be read: it is empty")
-    return found.st_size
+    return status.st_size
 
 
 def require_place(path: Path, overwrite: bool = False, captures_too: bool = False) -> None:
@@ -113,12 +113,12 @@ def require_room(path: Path, values: int, error: type[ProcessError] = ProcessErr
 
 def require_distinct(paths: Iterable[Path]) -> None:
     """Raise ProcessError where a file is given twice: what it says would count twice, and errors come out too small."""
-    seen: dict[tuple[int, int], Path] = {}
+    first_path: dict[tuple[int, int], Path] = {}
     for path in paths:
         # What is not there is told by its reader.
         if path.exists():
-            found = path.stat()
-            first = seen.setdefault((found.st_dev, found.st_ino), path)
+            status = path.stat()
+            first = first_path.setdefault((status.st_dev, status.st_ino), path)
             if first is not path:
                 also = "" if first == path else f", also as {first}"
                 raise ProcessError(f"{path} is given twice{also}; it would count twice.")

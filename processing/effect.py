@@ -104,23 +104,23 @@ def found_in(package: str, family: type[E], group: str) -> dict[str, E]:
     ------
     EffectError : a module defines no effect of the family, or more than one; a plug-in offers one that exists.
     """
-    found: dict[str, E] = {}
+    effects: dict[str, E] = {}
     for info in sorted(pkgutil.iter_modules(importlib.import_module(package).__path__), key=lambda i: i.name):
         if info.name != BASE and not info.name.startswith("_"):
-            found[info.name] = _only_effect(f"{package}.{info.name}", family)()
+            effects[info.name] = _only_effect(f"{package}.{info.name}", family)()
     for entry in entry_points(group=group):
-        if entry.name in found:
+        if entry.name in effects:
             raise EffectError(f"plug-in {entry.value} offers the effect {entry.name!r}, which exists already")
-        found[entry.name] = entry.load()()
-    for kind, effect in found.items():
+        effects[entry.name] = entry.load()()
+    for kind, effect in effects.items():
         effect.kind = kind
-    return found
+    return effects
 
 
 def _only_effect(module: str, family: type[E]) -> type[E]:
     classes = inspect.getmembers(importlib.import_module(module), inspect.isclass)
-    own = [c for _, c in classes if c.__module__ == module and issubclass(c, family) and not inspect.isabstract(c)]
-    if len(own) != 1:
-        names = ", ".join(c.__name__ for c in own) or "none"
+    kinds = [c for _, c in classes if c.__module__ == module and issubclass(c, family) and not inspect.isabstract(c)]
+    if len(kinds) != 1:
+        names = ", ".join(c.__name__ for c in kinds) or "none"
         raise EffectError(f"{module} has to define one {family.__name__}; it defines {names}")
-    return own[0]
+    return kinds[0]

@@ -114,11 +114,11 @@ def open_campaign(folder: Path | str, kind: str = "mueller") -> xr.Dataset:
     for place, paths in places.items():
         where = tuple([text for text, _ in axis].index(str(value)) for axis, value in zip(axes, place, strict=True))
         grid[where][: len(paths)] = [str(path) for path in paths]
-    one = _of_product(first[0])
+    example = _of_product(first[0])
     leading = ("sample", "wavelength", "omega", "repeat")
     variables = {
         str(name): ((*leading, *plane.dims), _on_demand(grid, str(name), plane.dtype, plane.shape), plane.attrs)
-        for name, plane in one.data_vars.items()
+        for name, plane in example.data_vars.items()
         if plane.dtype.kind == "f"
     }
     coords: dict[str, Any] = {
@@ -127,8 +127,8 @@ def open_campaign(folder: Path | str, kind: str = "mueller") -> xr.Dataset:
         "omega": ("omega", [value for _, value in axes[2]], {"units": "degree"}),
         "file": (leading, grid.astype(str)),
     }
-    attributes = {"kind": kind, "simulated": one.attrs["simulated"]}
-    return xr.Dataset(variables, coords | dict(one.coords), attributes)
+    attributes = {"kind": kind, "simulated": example.attrs["simulated"]}
+    return xr.Dataset(variables, coords | dict(example.coords), attributes)
 
 
 def follow_region(folder: Path | str, region: str | None = None, kind: str = "mueller") -> xr.Dataset:
@@ -173,8 +173,8 @@ def follow_region(folder: Path | str, region: str | None = None, kind: str = "mu
             header, time = product.header, taken_at(product)
             place = parse_region(region, product.shape)
         means = mean_of([path], place)
-        names = names or [one.name for one in means]
-        if [one.name for one in means] != names:
+        names = names or [mean.name for mean in means]
+        if [mean.name for mean in means] != names:
             raise ProcessError(f"{path}: its instrument determines other quantities than that of {lines[0][0]}")
         sample = header.sample.name or header.sample.kind
         omega = np.nan if header.omega_deg is None else header.omega_deg
@@ -183,11 +183,11 @@ def follow_region(folder: Path | str, region: str | None = None, kind: str = "mu
         lines.append((str(path), sample, header.wavelength_nm, omega, stamp, means))
     if not lines:
         raise ProcessError(f"{folder}: no product of kind {kind!r}. Make them: umov process reduce {folder}")
-    file, *columns, found = zip(*lines, strict=True)
+    file, *columns, all_means = zip(*lines, strict=True)
     labels = ("sample", "wavelength", "omega", "time")
     coords = {label: ("file", list(column)) for label, column in zip(labels, columns, strict=True)}
     data = {
-        name: (("file", "quantity"), [[getattr(one, name) for one in means] for means in found])
+        name: (("file", "quantity"), [[getattr(mean, name) for mean in means] for means in all_means])
         for name in ("value", "u_noise", "u_systematic")
     }
     return xr.Dataset(data, {"file": list(file), "quantity": names, **coords})

@@ -94,8 +94,8 @@ def parse_yaml(text: str, model: type[Model], source: str = "text") -> Model:
         value = model.model_validate(_plain(tree))
     except ValidationError as error:
         lines = _described(source, tree, model, mistakes_of(error))
-        told = {line.split(" ", 1)[0] for line in lines}
-        more = [line for line in _not_finite(source, tree, _scalars(tree)) if line.split(" ", 1)[0] not in told]
+        places = {line.split(" ", 1)[0] for line in lines}
+        more = [line for line in _not_finite(source, tree, _scalars(tree)) if line.split(" ", 1)[0] not in places]
         raise _refusal(source, lines + more) from error
     # As the model understood them: the text "nan" and the word true become numbers where one is asked for.
     understood = list(_scalars(value.model_dump(exclude_unset=True)))
@@ -151,8 +151,8 @@ def _place(source: str, tree: CommentedMap, where: tuple[Any, ...]) -> str:
 
 
 def _refusal(source: str, lines: list[str]) -> ConfigError:
-    left = [f"{source}: and {len(lines) - MOST_LINES} more"] if len(lines) > MOST_LINES else []
-    return ConfigError("\n".join(lines[:MOST_LINES] + left))
+    summary = [f"{source}: and {len(lines) - MOST_LINES} more"] if len(lines) > MOST_LINES else []
+    return ConfigError("\n".join(lines[:MOST_LINES] + summary))
 
 
 def _tree(text: str, source: str) -> CommentedMap:
@@ -162,8 +162,8 @@ def _tree(text: str, source: str) -> CommentedMap:
         tree = _parsed(text)
     except MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else "?"
-        what = "a tab; YAML is indented with spaces" if "'\\t'" in str(error.problem) else one_line(error.problem)
-        raise ConfigError(f"{source}:{line}: {what}") from error
+        problem = "a tab; YAML is indented with spaces" if "'\\t'" in str(error.problem) else one_line(error.problem)
+        raise ConfigError(f"{source}:{line}: {problem}") from error
     except (YAMLError, ValueError, TypeError, AttributeError, KeyError, IndexError, AssertionError) as error:
         # The parser's own errors on tags and dates that are none come as Python's.
         raise ConfigError(f"{source}: is not YAML that can be read ({one_line(error)})") from error

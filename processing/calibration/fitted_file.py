@@ -61,13 +61,13 @@ def _forget(tree: Any, names: Sequence[str], wavelength_nm: float) -> None:
             old.pop(_key(old, wavelength_nm), None)
         elif old is not None:
             del tree["stderr"][name]
-    kept = [
+    correlations = [
         c
         for c in tree.get("correlations") or []
         if not set(names) & set(c["between"]) or abs(float(c.get("wavelength_nm") or 0) - wavelength_nm) >= 0.5
     ]
-    if kept or "correlations" in tree:
-        tree["correlations"] = kept
+    if correlations or "correlations" in tree:
+        tree["correlations"] = correlations
 
 
 def _correlate(tree: Any, fitted: FittedValues, wavelength_nm: float) -> None:

@@ -234,11 +234,11 @@ def free_design(
             angles = random.uniform(0, np.pi, (len(cost.axes), states))
         spread = random.normal(0, 0.2, nominal.size) if start else 0.0
         x = np.concatenate([angles.reshape(-1), nominal + spread])
-        found = minimize(cost, x, jac=True, method="L-BFGS-B", options={"maxiter": 500, "maxcor": 20})
-        if best is None or found.fun < best[0]:
-            x = np.asarray(found.x)
+        minimum = minimize(cost, x, jac=True, method="L-BFGS-B", options={"maxiter": 500, "maxcor": 20})
+        if best is None or minimum.fun < best[0]:
+            x = np.asarray(minimum.x)
             x[: len(cost.axes) * states] %= 2 * np.pi
-            best = (float(found.fun), x)
+            best = (float(minimum.fun), x)
         if progress:
             progress(start + 1, STARTS)
         plain = _plain(model, cost, best[1])

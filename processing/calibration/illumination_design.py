@@ -20,13 +20,13 @@ PAPER_OMEGA_DEG = tuple(float(v) for v in range(20, 91, 5))
 
 def linear_states(step_deg: float = 15.0) -> dict[str, Array]:
     """Stokes vectors of unit power by name: linear at every `step_deg` (horizontal is 0, vertical 90), circular."""
-    found: dict[str, Array] = {}
+    states: dict[str, Array] = {}
     for angle in np.arange(0.0, 180.0, step_deg):
         name = {0.0: "horizontal", 90.0: "vertical"}.get(float(angle), f"linear {angle:g} deg")
         t = 2 * np.deg2rad(angle)
-        found[name] = np.array([1.0, np.cos(t), np.sin(t), 0.0])
-    found["right circular"], found["left circular"] = np.array([1.0, 0, 0, 1]), np.array([1.0, 0, 0, -1])
-    return found
+        states[name] = np.array([1.0, np.cos(t), np.sin(t), 0.0])
+    states["right circular"], states["left circular"] = np.array([1.0, 0, 0, 1]), np.array([1.0, 0, 0, -1])
+    return states
 
 
 @dataclass(frozen=True)
@@ -84,21 +84,21 @@ def predict(
     states : Stokes vectors of unit power, by name.
     pixels : the object is sampled with so many rows and columns.
     """
-    given = assumptions or Assumptions()
+    assumed = assumptions or Assumptions()
     analyzers = camera.at(wavelength_nm).analyzer_states({})[0]
     columns: dict[str, list[tuple[float, ...]]] = {name: [] for name in states}
     for done, omega in enumerate(omega_deg, 1):
         image = view.at(omega, pixels, pixels)
         m0 = model.mueller_jones(image.points, wavelength_nm)
         for name, stokes in states.items():
-            columns[name].append(_summary(predicted(m0, image.points, analyzers, stokes, given=given)))
+            columns[name].append(_summary(predicted(m0, image.points, analyzers, stokes, given=assumed)))
         if progress:
             progress(done, len(omega_deg))
-    found = []
+    predictions = []
     for name, stokes in states.items():
         p90, median, lost, condition = np.array(columns[name]).T
-        found.append(Prediction(name, stokes, np.asarray(omega_deg, dtype=float), p90, median, lost, condition))
-    return sorted(found, key=lambda p: p.score)
+        predictions.append(Prediction(name, stokes, np.asarray(omega_deg, dtype=float), p90, median, lost, condition))
+    return sorted(predictions, key=lambda p: p.score)
 
 
 def predicted(

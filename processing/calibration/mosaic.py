@@ -52,10 +52,10 @@ def fit_response(
     states = sample_states(capture)
     light = model.generator_states({k: v[states] for k, v in capture.angles_deg.items()})[:, :LINEAR]
     light = light * relative_exposure(capture, states)[:, None]
-    found = int(np.linalg.matrix_rank(light, rtol=1e-3))
-    if found < LINEAR:
+    rank = int(np.linalg.matrix_rank(light, rtol=1e-3))
+    if rank < LINEAR:
         raise NotDetermined(
-            f"{capture.path}: {len(states)} states of the generator have rank {found} in "
+            f"{capture.path}: {len(states)} states of the generator have rank {rank} in "
             "(S0, S1, S2), and 3 are needed. Turn the polarizer to at least three different angles."
         )
     reader = BlockReader(capture, states, CountCorrection.of(capture))
@@ -73,9 +73,9 @@ def fit_response(
         signal: NDArray[np.float32] = corrected[:, 0, :]
         part = np.empty((LINEAR, frames.shape[2]), np.float32)
         multiply_tiles(inverse, signal, part)
-        left = signal - light.astype(np.float32) @ part
+        misfit = signal - light.astype(np.float32) @ part
         with np.errstate(divide="ignore", invalid="ignore"):
-            rms = np.sqrt(np.mean(left**2, axis=0)) / np.mean(signal, axis=0)
+            rms = np.sqrt(np.mean(misfit**2, axis=0)) / np.mean(signal, axis=0)
         response[:, block] = part.reshape(LINEAR, -1, columns)
         residual[block] = rms.reshape(-1, columns)
     response /= 2 * np.nanmean(response[0])

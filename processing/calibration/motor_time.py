@@ -79,11 +79,11 @@ def ordered(angles: Array, periods: Array, speeds: Sequence[Speed]) -> Array:
     apart = angles[:, :, None] - angles[:, None, :]
     apart -= periods[:, None, None] * np.round(apart / periods[:, None, None])
     cost = np.max([s.seconds(apart[k]) for k, s in enumerate(speeds)], axis=0)
-    left, route = set(range(1, n)), [0]
-    while left:
-        nearest = min(left, key=lambda k: cost[route[-1], k])
+    pending, route = set(range(1, n)), [0]
+    while pending:
+        nearest = min(pending, key=lambda k: cost[route[-1], k])
         route.append(nearest)
-        left.remove(nearest)
+        pending.remove(nearest)
     path = np.array(route)
     for _ in range(ROUNDS):
         changed = False
@@ -125,23 +125,23 @@ def front(
     missing = [axis for axis in model.axes if axis not in speeds]
     if missing:
         raise ProcessError(f"--speed is missing for: {', '.join(missing)}")
-    own = [speeds[axis] for axis in model.axes]
+    rates = [speeds[axis] for axis in model.axes]
     turn = np.array([periods_deg(model)[axis] for axis in model.axes])
     best = free_design(model, states, goal, free_retardances, progress=progress)
     cost = Cost(model, states, goal or Goal(), tuple(best.retardances_deg) if free_retardances else ())
-    angles = ordered(np.stack([best.angles_deg[axis] for axis in model.axes]), turn, own)
+    angles = ordered(np.stack([best.angles_deg[axis] for axis in model.axes]), turn, rates)
     retardances = np.deg2rad([best.retardances_deg[name] for name in cost.free])
-    found = []
+    points = []
     for weight in WEIGHTS:
         if weight:
             x = np.concatenate([np.deg2rad(angles).reshape(-1), retardances])
-            solved = minimize(_both(cost, own, weight), x, jac=True, method="L-BFGS-B", options={"maxiter": 300})
+            solved = minimize(_both(cost, rates, weight), x, jac=True, method="L-BFGS-B", options={"maxiter": 300})
             moved, retardances = cost.split(np.asarray(solved.x))
-            angles = ordered(np.rad2deg(moved), turn, own)
+            angles = ordered(np.rad2deg(moved), turn, rates)
         design = design_of(model, cost, np.concatenate([np.deg2rad(angles).reshape(-1), retardances]), best.bound)
-        found.append(Point(design, move_seconds(angles, own)))
-    found.sort(key=lambda p: p.design.variance)
-    return [p for k, p in enumerate(found) if all(p.seconds < q.seconds for q in found[:k])]
+        points.append(Point(design, move_seconds(angles, rates)))
+    points.sort(key=lambda p: p.design.variance)
+    return [p for k, p in enumerate(points) if all(p.seconds < q.seconds for q in points[:k])]
 
 
 def _both(cost: Cost, speeds: Sequence[Speed], weight: float) -> Callable[[Array], tuple[float, Array]]:

@@ -240,7 +240,7 @@ def _warnings(line: PhotonTransfer, capture: Capture) -> list[str]:
             f"the variance does not follow a straight line (reduced chi-square {line.chi_square:.1f}): the camera "
             "is not linear there, or the scene changed between repeats"
         )
-    told = capture.header.detector.gain_e_per_count
-    if told is not None and abs(line.gain_e_per_count - told) > 5 * line.gain_stderr + 0.02 * told:
-        out.append(f"the capture's header says {told:g} e/count, the frames say {line.gain_e_per_count:.4g}")
+    stated = capture.header.detector.gain_e_per_count
+    if stated is not None and abs(line.gain_e_per_count - stated) > 5 * line.gain_stderr + 0.02 * stated:
+        out.append(f"the capture's header says {stated:g} e/count, the frames say {line.gain_e_per_count:.4g}")
     return out

@@ -79,10 +79,10 @@ def score(w: Array, noise: AssumedNoise, basis: Array | None = None, bound: floa
     """
     w = np.asarray(w, dtype=float).reshape(-1, 16)
     basis = np.eye(16) if basis is None else basis
-    n, found, wanted = len(w), rank(w), basis.shape[1]
+    n, determined, needed = len(w), rank(w), basis.shape[1]
     bound = 1600 / n if bound is None else bound
-    if found < wanted:
-        return Score(n, found, wanted, np.inf, np.inf, bound, np.full((4, 4), np.inf))
+    if determined < needed:
+        return Score(n, determined, needed, np.inf, np.inf, bound, np.full((4, 4), np.inf))
     inverse = basis @ np.linalg.pinv(w @ basis)
     # An ideal depolarizer of throughput m00 gives every state m00 w_n0.
     m00 = noise.electrons / w[:, 0].mean()
@@ -92,7 +92,7 @@ def score(w: Array, noise: AssumedNoise, basis: Array | None = None, bound: floa
     stderr[~determined_elements(basis)] = np.nan
     size = np.linalg.svd(w @ basis, compute_uv=False)
     variance_sum = equally_weighted_variance(w @ basis)
-    return Score(n, found, wanted, float(size[0] / size[-1]), variance_sum, bound, stderr.reshape(4, 4))
+    return Score(n, determined, needed, float(size[0] / size[-1]), variance_sum, bound, stderr.reshape(4, 4))
 
 
 def equally_weighted_variance(w: Array) -> float:
@@ -162,7 +162,7 @@ def two_retarders(model: InstrumentModel) -> tuple[Retarder, Retarder]:
     ------
     ProcessError : the instrument is not of that kind, so there is nothing to optimize here.
     """
-    found: list[Retarder] = []
+    retarders: list[Retarder] = []
     for side, train in (("generator", model.generator), ("analyzer", model.analyzer)):
         turning = [e for e in train if e.axis is not None]
         if len(turning) != 1 or not isinstance(turning[0], Retarder) or len(model.channels) != 1:
@@ -171,8 +171,8 @@ def two_retarders(model: InstrumentModel) -> tuple[Retarder, Retarder]:
                 f"only dual rotating retarders with one channel are optimized; the {side} of {model.name!r} has the "
                 f"turning elements: {names}. Score a table of your own with --table instead."
             )
-        found.append(turning[0])
-    return found[0], found[1]
+        retarders.append(turning[0])
+    return retarders[0], retarders[1]
 
 
 def rows_of_design(
@@ -248,8 +248,8 @@ def _best_retardances(
     first = cost(start)
     if first > min(HOPELESS * 1600 / n, 1.5 * to_beat):
         return first, ratio, float(start[0]), float(start[1])
-    found = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-4, "maxiter": 120})
-    return float(found.fun), ratio, float(found.x[0]), float(found.x[1])
+    minimum = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-4, "maxiter": 120})
+    return float(minimum.fun), ratio, float(minimum.x[0]), float(minimum.x[1])
 
 
 def _analyzer_azimuth(model: InstrumentModel) -> float:

@@ -132,10 +132,10 @@ def fit_trains(parts: Sequence[KnownCapture], free: Sequence[str]) -> list[Calib
     """
     names = checked_names(parts[0].model, free)
     fit = _Fit(parts, TrainValues.shared(parts[0].model, names, _wavelengths(parts), None))
-    found = fit.searched_from(fit.nominal, np.ones(len(parts)))
+    minimum = fit.searched_from(fit.nominal, np.ones(len(parts)))
     if len(set(_wavelengths(parts))) > 1:
-        found = fit.searched_from(fit.values(found.x), fit.units(found))
-    return fit.calibrations(found)
+        minimum = fit.searched_from(fit.values(minimum.x), fit.units(minimum))
+    return fit.calibrations(minimum)
 
 
 def fit_curves(parts: Sequence[KnownCapture], free: Sequence[str], coefficients: int) -> CurveFit:
@@ -160,25 +160,25 @@ def fit_curves(parts: Sequence[KnownCapture], free: Sequence[str], coefficients:
     first = separate.searched_from(separate.nominal, np.ones(len(parts)))
     units = separate.units(first)
     free_fit = separate.searched_from(separate.values(first.x), units)
-    found = smooth.searched_from(separate.values(free_fit.x), units)
-    chance = _chance(found, smooth.freedom, free_fit, separate.freedom)
+    minimum = smooth.searched_from(separate.values(free_fit.x), units)
+    chance = _chance(minimum, smooth.freedom, free_fit, separate.freedom)
     if chance is not None and chance < UNLIKELY:
         # Some of the values at a wavelength may lie in another valley than the rest.
-        other = smooth.searched_from(smooth.nominal, units)
-        found = min(found, other, key=lambda f: float(f.cost))
-        chance = _chance(found, smooth.freedom, free_fit, separate.freedom)
-    calibrations = smooth.calibrations(found)
+        second = smooth.searched_from(smooth.nominal, units)
+        minimum = min(minimum, second, key=lambda f: float(f.cost))
+        chance = _chance(minimum, smooth.freedom, free_fit, separate.freedom)
+    calibrations = smooth.calibrations(minimum)
     for part, calibration in zip(parts, calibrations, strict=True):
         smooth.shared.check_range(part.model, calibration.values, part.wavelength_nm)
     return CurveFit(
         calibrations=tuple(calibrations),
         curved=smooth.shared.curved,
-        residual_over_mean=smooth.rms(found.x),
+        residual_over_mean=smooth.rms(minimum.x),
         separate_residual=separate.rms(free_fit.x),
         chance=chance,
         shared=smooth.shared,
-        searched=found.x,
-        covariance=smooth.covariance(found),
+        searched=minimum.x,
+        covariance=smooth.covariance(minimum),
     )
 
 
@@ -231,15 +231,15 @@ class _Fit:
 
         wavelengths = _wavelengths(self.parts)
         start = self.shared.nearest(wavelengths, self.nominal, values)
-        found = search(start)
-        if self.rms(found.x) > POOR_FIT:
+        minimum = search(start)
+        if self.rms(minimum.x) > POOR_FIT:
             # Azimuths have several valleys; a residual like this is the bottom of a wrong one.
-            found = min([found, *(search(x0) for x0 in self._other_starts(start))], key=lambda f: float(f.cost))
-        if not found.success:
+            minimum = min([minimum, *(search(x0) for x0 in self._other_starts(start))], key=lambda f: float(f.cost))
+        if not minimum.success:
             raise NotDetermined(
-                f"the fit did not converge ({found.message}); start from an instrument file closer to the truth"
+                f"the fit did not converge ({minimum.message}); start from an instrument file closer to the truth"
             )
-        return found
+        return minimum
 
     def units(self, found: Any) -> NDArray[np.float64]:
         """(parts,) rms of the residual over the mean signal at the wavelength of each, noise that the fit took added.
@@ -249,15 +249,15 @@ class _Fit:
         # What each intensity pulls the fit to itself: the diagonal of the projection onto the derivatives.
         u, singular, _ = np.linalg.svd(found.jac * self.shared.scale[0], full_matrices=False)
         pulled = np.split(np.sum(u[:, singular > UNSEEN * singular[0]] ** 2, axis=1), self._edges)
-        left = np.split(found.fun, self._edges)
+        residuals = np.split(found.fun, self._edges)
         wavelengths = np.array(_wavelengths(self.parts))
         out = np.empty(len(self.parts))
         for nm in np.unique(wavelengths):
-            here = np.flatnonzero(wavelengths == nm).tolist()
-            square = sum(float(np.sum(left[k] ** 2)) for k in here)
-            free = sum(self.parts[k].data.size - self.parts[k].throughputs - float(pulled[k].sum()) for k in here)
+            index = np.flatnonzero(wavelengths == nm).tolist()
+            square = sum(float(np.sum(residuals[k] ** 2)) for k in index)
+            free = sum(self.parts[k].data.size - self.parts[k].throughputs - float(pulled[k].sum()) for k in index)
             total = float(np.sum(found.fun**2)) / self.freedom
-            out[here] = max(np.sqrt(square / free if free >= 1 else total), LEAST_RESIDUAL)
+            out[index] = max(np.sqrt(square / free if free >= 1 else total), LEAST_RESIDUAL)
         return out
 
     def covariance(self, found: Any) -> NDArray[np.float64]:
@@ -287,12 +287,12 @@ class _Fit:
         out = []
         for part, matrix in zip(self.parts, self._matrices, strict=True):
             fitted = _fitted(self.shared, part.model, matrix, found.x, covariance=covariance)
-            rest = part.residual(fitted.model)
+            residual = part.residual(fitted.model)
             out.append(
                 Calibration(
                     **vars(fitted),
-                    residual_over_mean=float(np.sqrt(np.mean(rest**2))),
-                    residual=rest.reshape(*part.signal.shape[:2], -1).mean(axis=2),
+                    residual_over_mean=float(np.sqrt(np.mean(residual**2))),
+                    residual=residual.reshape(*part.signal.shape[:2], -1).mean(axis=2),
                 )
             )
         return out

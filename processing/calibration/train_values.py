@@ -36,8 +36,8 @@ def checked_names(model: InstrumentModel, free: Sequence[str]) -> tuple[str, ...
     offered = [f"{e.name}.{field}" for e in model.elements() for field in FITTABLE if _fits(e, field)]
     unknown = [name for name in names if name not in offered]
     if unknown or not names:
-        asked = ", ".join(unknown) or "none given"
-        raise CalibrationError(f"free parameter: {asked}. This instrument has: {', '.join(offered)}.")
+        listed = ", ".join(unknown) or "none given"
+        raise CalibrationError(f"free parameter: {listed}. This instrument has: {', '.join(offered)}.")
     return names
 
 

@@ -44,7 +44,7 @@ def find_captures(folder: Path, out: Path | None = None, of_objects: bool = True
     ------
     ProcessError : no capture, or simulated and measured ones together.
     """
-    found, kinds, left_out = [], {}, []
+    captures, kinds, left_out = [], {}, []
     damaged: list[tuple[Path, Exception]] = []
     for path in sorted(folder.rglob("*.h5")):
         if (out is not None and path.is_relative_to(out)) or made_of_captures(path):
@@ -72,9 +72,9 @@ def find_captures(folder: Path, out: Path | None = None, of_objects: bool = True
         kinds[path] = simulated
         nm, omega = float(header.wavelength_nm), float("nan" if header.omega_deg is None else header.omega_deg)
         sample = header.sample.name or header.sample.kind
-        found.append(ObjectCapture(path, kind, nm, omega, header.mode, sample, is_reference))
+        captures.append(ObjectCapture(path, kind, nm, omega, header.mode, sample, is_reference))
     left_out += _unfinished(folder, out)
-    if not found:
+    if not captures:
         raise ProcessError(
             f"{folder} holds no complete capture{' of an object with an arm angle' * of_objects}. "
             f"{' '.join([*(str(error) for _, error in damaged), *left_out][:3])}"
@@ -86,7 +86,7 @@ def find_captures(folder: Path, out: Path | None = None, of_objects: bool = True
             f"{folder} mixes simulated captures ({simulated_one.name}) and measured ones ({measured_one.name}); "
             "they are never compared as one campaign. Put them into two folders."
         )
-    return FoundCaptures(found, next(iter(kinds.values())), left_out, damaged)
+    return FoundCaptures(captures, next(iter(kinds.values())), left_out, damaged)
 
 
 def _unfinished(folder: Path, out: Path | None) -> list[str]:
@@ -121,49 +121,49 @@ def chosen(
     ------
     ProcessError : no capture is of a mode or sample, or two captures would be compared with the same others.
     """
-    for what, wanted, there in (
+    for word, names, present in (
         ("mode", modes, {capture.mode for capture in captures}),
         ("sample", samples, {capture.sample for capture in captures}),
     ):
-        if unknown := [name for name in wanted if name not in there]:
-            raise ProcessError(f"no capture is of the {what} {unknown[0]!r}; there are: {', '.join(sorted(there))}.")
-    taken, left_out = [], []
+        if unknown := [name for name in names if name not in present]:
+            raise ProcessError(f"no capture is of the {word} {unknown[0]!r}; there are: {', '.join(sorted(present))}.")
+    selection, left_out = [], []
     for capture in captures:
         if (modes and capture.mode not in modes) or (samples and capture.sample not in samples):
             left_out.append(f"{capture.path}: mode {capture.mode}, sample {capture.sample}; not asked for")
         else:
-            taken.append(capture)
-    if not taken:
+            selection.append(capture)
+    if not selection:
         raise ProcessError("no capture is of that mode and that sample.")
     if not twins:
-        _refuse_twins(taken)
-    return taken, left_out
+        _refuse_twins(selection)
+    return selection, left_out
 
 
 def flats_of(folder: Path, captures: Sequence[ObjectCapture]) -> dict[Path, Path]:
     """The flat field of each capture that has one: of its camera and wavelength, nearest in time."""
-    known = flat_captures(folder)
-    found = {}
-    for path, *_ in captures if known else ():
+    flats = flat_captures(folder)
+    by_capture = {}
+    for path, *_ in captures if flats else ():
         with Capture(path) as capture:
-            if (flat := nearest_flat(known, capture)) is not None:
-                found[path] = flat
-    return found
+            if (flat := nearest_flat(flats, capture)) is not None:
+                by_capture[path] = flat
+    return by_capture
 
 
 def _refuse_twins(captures: Sequence[ObjectCapture]) -> None:
-    seen: dict[tuple[str, float, float], ObjectCapture] = {}
+    first: dict[tuple[str, float, float], ObjectCapture] = {}
     for capture in captures:
-        twin = seen.setdefault((capture.kind, capture.wavelength_nm, round(capture.omega_deg, 2)), capture)
+        twin = first.setdefault((capture.kind, capture.wavelength_nm, round(capture.omega_deg, 2)), capture)
         if twin is capture:
             continue
         says = f"{twin.path.name} and {capture.path.name} are both {capture.kind} captures at"
         says += f" {capture.wavelength_nm:g} nm, {capture.omega_deg:g} degrees"
-        for what in ("mode", "sample"):
-            one, other = getattr(twin, what), getattr(capture, what)
-            if one != other:
+        for field in ("mode", "sample"):
+            old, new = getattr(twin, field), getattr(capture, field)
+            if old != new:
                 raise ProcessError(
-                    f"{says}, of the {what}s {one} and {other}. Choose with --{what}, several times for several; each "
-                    f"choice needs a folder of its own for its results: --{what} {other} --out FOLDER."
+                    f"{says}, of the {field}s {old} and {new}. Choose with --{field}, several times for several; each "
+                    f"choice needs a folder of its own for its results: --{field} {new} --out FOLDER."
                 )
         raise ProcessError(f"{says}. Put one of them into another folder.")

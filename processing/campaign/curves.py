@@ -41,7 +41,7 @@ class CurvePoint(NamedTuple):
         place = {"sample": sample, "mode": mode, "kind": kind, "wavelength_nm": nm, "omega_deg": omega}
         place |= {"capture": path.name}
         columns = ("value", "u", "u_noise", "u_systematic", "low", "high", "unit")
-        return [place | {"quantity": one.name} | {name: getattr(one, name) for name in columns} for one in self.means]
+        return [place | {"quantity": m.name} | {name: getattr(m, name) for name in columns} for m in self.means]
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ class Curves:
         ------
         ProcessError : see `find_captures` and `chosen`.
         """
-        found, simulated, left_out, damaged = find_captures(self.folder, self.out, of_objects=False)
-        captures, others = chosen(found, self.modes, self.samples, twins=True)
+        candidates, simulated, left_out, damaged = find_captures(self.folder, self.out, of_objects=False)
+        captures, omitted = chosen(candidates, self.modes, self.samples, twins=True)
         self.out.mkdir(parents=True, exist_ok=True)
         flats, corrected = flats_of(self.folder, captures), self.instruments or {}
         tasks = [
@@ -91,7 +91,7 @@ class Curves:
         ]
         results = gather(pool, curve_point, tasks, progress)
         paths = [capture.path for capture in captures]
-        return [*zip(paths, results, strict=True), *damaged], simulated, left_out + others
+        return [*zip(paths, results, strict=True), *damaged], simulated, left_out + omitted
 
 
 @one_blas_thread()
@@ -99,7 +99,7 @@ def curve_point(task: CurveTask) -> CurvePoint:
     """Reduce a capture, unless its product exists, and average the region."""
     path = task.capture.path
     reduction = Reduction(path, task.instrument, flat=(task.flat,) if task.flat else ())
-    found = reduction.found_or_made(task.out / f"{path.stem}.{task.capture.kind}.h5")
-    with Product(found.path) as product:
+    output = reduction.found_or_made(task.out / f"{path.stem}.{task.capture.kind}.h5")
+    with Product(output.path) as product:
         region = parse_region(task.region, product.shape)
-    return CurvePoint(task.capture, found.path, found.was_there, tuple(mean_of([found.path], region)))
+    return CurvePoint(task.capture, output.path, output.was_there, tuple(mean_of([output.path], region)))

@@ -82,15 +82,15 @@ def compare(
         except ProcessError:
             # No pixel of this tile can be used.
             continue
-    tests = [one for one in changes if one.error > 0 and np.isfinite(one.value)]
+    tests = [change for change in changes if change.error > 0 and np.isfinite(change.value)]
     if not tests:
         raise ProcessError(f"{capture} and {reference} have no pixel in common that can be used.")
     limit = norm.isf(FALSE_ALARM / 2 / len(tests))
-    beyond = [one for one in tests if abs(one.value) > max(limit * one.error, tolerance)]
+    beyond = [change for change in tests if abs(change.value) > max(limit * change.error, tolerance)]
     light, *frame = _changes(products, (slice(0, shapes[0][0]), slice(0, shapes[0][1])))
     with Capture(capture) as opened:
         started, simulated = opened.start_time, opened.simulated
-    largest = max(beyond or tests, key=lambda one: abs(one.value))
+    largest = max(beyond or tests, key=lambda change: abs(change.value))
     return Change(started, capture.name, light, tuple(frame), largest, len(beyond), len(tests), simulated)
 
 
@@ -101,16 +101,16 @@ def _parts(size: int) -> list[slice]:
 
 def _changes(products: list[Path], region: Region) -> list[Changed]:
     """Relative change of the light, then the changes of the elements over it."""
-    new, old = ({one.name: one for one in mean_of([path], region)} for path in products)
+    new, old = ({mean.name: mean for mean in mean_of([path], region)} for path in products)
     light = next(name for name in LIGHT if name in new)
     level = old[light].value
     noise = float(np.hypot(new[light].u_noise, old[light].u_noise)) / level
-    found = [Changed(light, new[light].value / level - 1, noise, region)]
+    changes = [Changed(light, new[light].value / level - 1, noise, region)]
     for name in new:
         if name.endswith(("_over_m00", "_over_s0")) and name in old:
             error = float(np.hypot(new[name].u_noise, old[name].u_noise))
-            found.append(Changed(name.split("_")[0], new[name].value - old[name].value, error, region))
-    return found
+            changes.append(Changed(name.split("_")[0], new[name].value - old[name].value, error, region))
+    return changes
 
 
 def comparable(path: Path) -> dict[str, str]:
@@ -122,11 +122,11 @@ def comparable(path: Path) -> dict[str, str]:
 
 
 def _require_alike(capture: Path, reference: Path) -> None:
-    found, kept = comparable(capture), comparable(reference)
-    for name in found:
-        if found[name] != kept[name]:
+    new, old = comparable(capture), comparable(reference)
+    for name in new:
+        if new[name] != old[name]:
             raise ProcessError(
-                f"{capture}: {name} {found[name]}, but {reference}: {kept[name]}. "
+                f"{capture}: {name} {new[name]}, but {reference}: {old[name]}. "
                 "Give a capture of the same sample as --reference."
             )
 
@@ -137,13 +137,13 @@ def keep(change: Change, reference: Path) -> Path:
     rows: dict[str, Mapping[str, str]] = {row["capture"]: row for row in read_checks(path)} if path.exists() else {}
     row = {"start_time": change.start_time, "capture": change.capture}
     row |= {"verdict": "changed" if change.count else "unchanged", "light_percent": f"{100 * change.light.value:.4g}"}
-    for one in change.frame:
-        row |= {one.name: f"{one.value:.4g}", f"{one.name}_error": f"{one.error:.2g}"}
+    for element in change.frame:
+        row |= {element.name: f"{element.value:.4g}", f"{element.name}_error": f"{element.error:.2g}"}
     rows[change.capture] = row
     with whole_file(path) as new, new.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(row))
         writer.writeheader()
-        writer.writerows(sorted(rows.values(), key=lambda one: one["start_time"]))
+        writer.writerows(sorted(rows.values(), key=lambda r: r["start_time"]))
     return path
 
 

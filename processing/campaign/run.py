@@ -125,9 +125,9 @@ class ProcessedCampaign:
         ------
         ProcessError : see `find_captures` and `chosen`.
         """
-        found, simulated, left_out, damaged = find_captures(self.folder, self.out)
-        captures, others = chosen(found, self.modes, self.samples)
-        left_out = left_out + others
+        candidates, simulated, left_out, damaged = find_captures(self.folder, self.out)
+        captures, omitted = chosen(candidates, self.modes, self.samples)
+        left_out = left_out + omitted
         self.out.mkdir(parents=True, exist_ok=True)
         flats = flats_of(self.folder, captures)
         tasks = [self._task(capture.path, capture.kind, flats.get(capture.path)) for capture in captures]
@@ -137,7 +137,7 @@ class ProcessedCampaign:
         results = gather(pool, measure, tasks, progress)
         measures = [result for result in results if isinstance(result, CaptureMeasure)]
         pairs = zip(captures, results, strict=True)
-        failed = (*damaged, *((one.path, result) for one, result in pairs if isinstance(result, Exception)))
+        failed = (*damaged, *((capture.path, result) for capture, result in pairs if isinstance(result, Exception)))
         tables = _merged_tables(measures, self.out)
         rows = tuple(_rows(measures, tables, views))
         names = {path.name: flat.name for path, flat in flats.items()}
@@ -160,10 +160,10 @@ class ProcessedCampaign:
 def _registered(tasks: Sequence[CaptureTask], pool: Executor) -> list[CaptureTask]:
     # Camera and sphere stand still while the arm turns: each instrument takes its best image, mostly a side view.
     best: dict[str, tuple[float, str]] = {}
-    for task, found in zip(tasks, gather(pool, locate, tasks), strict=True):
+    for task, outline in zip(tasks, gather(pool, locate, tasks), strict=True):
         # A capture that fails here fails again where it is measured, and is reported there.
-        if isinstance(found, tuple) and (task.kind not in best or found < best[task.kind]):
-            best[task.kind] = found
+        if isinstance(outline, tuple) and (task.kind not in best or outline < best[task.kind]):
+            best[task.kind] = outline
     lacking = sorted({t.kind for t in tasks} - set(best))
     if lacking:
         raise NotDetermined(f"no sphere could be found in any {' or '.join(lacking)} image; leave --register away.")
@@ -195,16 +195,16 @@ def _rows(
     for nm in sorted({m.wavelength_nm for m in measures}):
         loaded = {k: ScatteringTable.load(tables[k, nm]) for k in ("mueller", "stokes") if (k, nm) in tables}
         for omega in sorted({round(m.omega_deg, 2) for m in measures if m.wavelength_nm == nm}):
-            here = {m.kind: m for m in measures if (m.wavelength_nm, round(m.omega_deg, 2)) == (nm, omega)}
+            by_kind = {m.kind: m for m in measures if (m.wavelength_nm, round(m.omega_deg, 2)) == (nm, omega)}
             values: dict[str, Any] = {}
-            if "mueller" in here:
-                m = here["mueller"]
+            if "mueller" in by_kind:
+                m = by_kind["mueller"]
                 values |= {"psi_deg": m.psi_deg, "magnitude_percent": m.magnitude_percent}
                 values |= {"psi_noise_deg": m.psi_noise_deg, "magnitude_noise_percent": m.magnitude_noise_percent}
                 values |= {"eigenvalue_deviation": m.eigenvalue_deviation, "eigenvalue_noise": m.eigenvalue_noise}
-            if "stokes" in here and len(loaded) == 2:
+            if "stokes" in by_kind and len(loaded) == 2:
                 values |= compare_on_sphere(
-                    loaded["mueller"], loaded["stokes"], views["stokes"], omega, shape=here["stokes"].shape
+                    loaded["mueller"], loaded["stokes"], views["stokes"], omega, shape=by_kind["stokes"].shape
                 )
             rows.append(Row(nm, omega, **values))
     return rows
@@ -229,15 +229,15 @@ def compare_on_sphere(
         raise NotDetermined(f"no pixel of the virtual object is lit at omega {omega_deg:g} degrees")
     tables, angles = (reference, other), image.points.angles
     a, b = (table.lookup(angles)[0] for table in tables)
-    both = np.isfinite(b - a)
-    if not both.any():
+    common = np.isfinite(b - a)
+    if not common.any():
         return {"common": 0.0}
-    noise = [table.lookup(angles, of=table.uncertainties["u_noise"])[0, both] for table in tables]
-    moved = [table.lookup(angles, of=table.directions)[:, 0, both] for table in tables]
+    noise = [table.lookup(angles, of=table.uncertainties["u_noise"])[0, common] for table in tables]
+    moved = [table.lookup(angles, of=table.directions)[:, 0, common] for table in tables]
     _, aligned = of_all_inputs([table.inputs for table in tables], moved)
-    parts = {"": [(b - a)[both]], "noise_": noise, "systematic_": [aligned[1] - aligned[0]]}
-    found = {f"xi0_{name}percent": 100 * _size(part) for name, part in parts.items()}
-    return found | {"common": float(both.mean())}
+    parts = {"": [(b - a)[common]], "noise_": noise, "systematic_": [aligned[1] - aligned[0]]}
+    sizes = {f"xi0_{name}percent": 100 * _size(part) for name, part in parts.items()}
+    return sizes | {"common": float(common.mean())}
 
 
 def _size(parts: Sequence[NDArray[np.float64]]) -> float:

@@ -118,16 +118,16 @@ def reduced_product(task: CaptureTask) -> Path:
 def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) -> CaptureMeasure:
     with Product(product) as opened:
         require_all_elements(opened)
-        whole, systematic = MuellerImage.of(opened), Systematic.of_product(opened)
-    geometry = view.at(float(whole.header.omega_deg or 0.0), *whole.mask.shape)
+        full, systematic = MuellerImage.of(opened), Systematic.of_product(opened)
+    geometry = view.at(float(full.header.omega_deg or 0.0), *full.mask.shape)
     # The object alone, as rows of one pixel: what lies beside it costs as much.
-    image = whole.at(np.flatnonzero(geometry.mask))
+    image = full.at(np.flatnonzero(geometry.mask))
     m = image.matrices[:, 0].astype(float)
     model = load_reflectance(task.material).mueller_jones(geometry.points, image.header.wavelength_nm)
     m0 = xi0_and_dominant(m)[1]
     noise, eigenvalues = coherency_noise(image), coherency_eigenvalues(m)
-    found = corrected(np.asarray(eigenvalues[:, None], dtype=float), noise, image.covariance_of_depolarizer())
-    xi0, stderr = found.xi0[:, 0], found.stderr[:, 0]
+    result = corrected(np.asarray(eigenvalues[:, None], dtype=float), noise, image.covariance_of_depolarizer())
+    xi0, stderr = result.xi0[:, 0], result.stderr[:, 0]
     # A limit on the noise: one on the outcome would keep upward fluctuations only.
     good = np.isfinite(xi0) & ~(noise.overall[:, 0] > MAX_STDERR) & _inner(geometry, task.border_px)
     measured, modelled = linear_diattenuation(m0), linear_diattenuation(model)
@@ -142,7 +142,7 @@ def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) ->
         kind="mueller",
         wavelength_nm=image.header.wavelength_nm,
         omega_deg=float(image.header.omega_deg or 0.0),
-        shape=(whole.mask.shape[0], whole.mask.shape[1]),
+        shape=(full.mask.shape[0], full.mask.shape[1]),
         table=_table(task, product, geometry, (xi0, stderr, good), systematic=systematic, moves=moves),
         psi_deg=float(np.rad2deg(rmsd(psi))),
         magnitude_percent=100 * rmsd((magnitude(modelled) - magnitude(measured))[good]),
@@ -182,13 +182,13 @@ def _measure_stokes(task: CaptureTask, product: Path, view: ViewingGeometry) -> 
     geometry = view.at(float(header.omega_deg or 0.0), *image.mask.shape)
     model = load_reflectance(task.material).mueller_jones(geometry.points, header.wavelength_nm)
     m0 = np.asarray(geometry.fill(model), dtype=float)
-    found = estimate_from_stokes(image, m0)
+    result = estimate_from_stokes(image, m0)
     inside, moves = geometry.mask, None
     if systematic is not None:
         fitted = np.tensordot(image.analyzers, image.values.astype(float), axes=1)
-        moves = refitted(systematic, fitted, found.xi0, m0)[:, inside]
-    xi0, stderr = found.xi0[inside], found.xi0_stderr[inside]
-    good = found.valid[inside] & _inner(geometry, task.border_px)
+        moves = refitted(systematic, fitted, result.xi0, m0)[:, inside]
+    xi0, stderr = result.xi0[inside], result.xi0_stderr[inside]
+    good = result.valid[inside] & _inner(geometry, task.border_px)
     return CaptureMeasure(
         kind="stokes",
         wavelength_nm=header.wavelength_nm,

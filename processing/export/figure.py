@@ -34,14 +34,14 @@ def write_figure(source: Path, path: Path, planes: Sequence[str]) -> None:
         if not planes or (list(planes) == ["mueller"] and product.kind == "mueller"):
             figure = product_figure(product)
         else:
-            known = _known(product)
+            is_known = _known(product)
             panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = []
             for name in planes:
                 values = product.get(name)
                 unit = f" ({product.units(name)})" if product.units(name) else ""
                 for index in np.ndindex(*values.shape[:-2]):
                     place = "".join(str(k) for k in index)
-                    shown = values[index] if name in MASKS else np.where(known, values[index], np.nan)
+                    shown = values[index] if name in MASKS else np.where(is_known, values[index], np.nan)
                     scale = scale_of(name, product.units(name), shown)
                     limits = {"cmap": scale.colours, "vmin": scale.low, "vmax": scale.high}
                     panels.append((f"{name.replace('_', ' ')}{' ' + place if place else ''}{unit}", shown, limits))
@@ -53,8 +53,8 @@ def write_figure(source: Path, path: Path, planes: Sequence[str]) -> None:
 
 def _known(product: Product) -> NDArray[np.bool_]:
     """Where a product's own mask says that its values mean something; everywhere without one."""
-    known = np.ones(product.shape, dtype=bool)
+    mask = np.ones(product.shape, dtype=bool)
     for name in MASKS:
         if name in product.names:
-            known &= product.get(name) > 0
-    return known
+            mask &= product.get(name) > 0
+    return mask

@@ -48,14 +48,14 @@ def _to_tiff(dataset: xr.Dataset, names: list[str], out: Path, overwrite: bool) 
         require_place(path, overwrite)
     for name, path in zip(names, paths, strict=True):
         pages = list(_pages(dataset, name))
-        whole = np.iinfo(dataset[name].dtype).bits <= 16 if dataset[name].dtype.kind in "ui" else False
-        images = [Image.fromarray(page if whole else page.astype(np.float32)) for _, page in pages]
-        told = _facts(dataset) | dict(dataset[name].attrs) | {"pages": [label for label, _ in pages]}
+        is_small = np.iinfo(dataset[name].dtype).bits <= 16 if dataset[name].dtype.kind in "ui" else False
+        images = [Image.fromarray(page if is_small else page.astype(np.float32)) for _, page in pages]
+        description = _facts(dataset) | dict(dataset[name].attrs) | {"pages": [label for label, _ in pages]}
         size = sum(page.nbytes for _, page in pages)
         with whole_file(path) as new:
             images[0].save(
                 new, "TIFF", save_all=True, append_images=images[1:], big_tiff=size > 3 << 30,
-                description=json.dumps(told, default=str),
+                description=json.dumps(description, default=str),
             )  # fmt: skip
     return paths
 

@@ -37,8 +37,8 @@ class Flat(Section):
             & (np.abs(points @ across) <= self.width_mm / 2)
             & (np.abs(points[..., 1]) <= self.height_mm / 2)
         )
-        found = points[hit]
-        return hit, found, np.broadcast_to(normal, found.shape).copy()
+        inside = points[hit]
+        return hit, inside, np.broadcast_to(normal, inside.shape).copy()
 
     def occluded(self, points_mm: Array, towards: Array) -> NDArray[np.bool_]:
         """No point on the lit side is shaded by the shape itself: (N,) of False."""

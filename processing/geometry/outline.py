@@ -71,8 +71,8 @@ def find_sphere(image: ArrayLike, seed: int = 0) -> Circle:
         fit = least_squares(_distances, circle, args=(points,), loss="huber", f_scale=0.3)
         circle = fit.x
     residual = _distances(circle, points)
-    kept = np.abs(residual) < 5 * max(1.4826 * float(np.median(np.abs(residual))), 0.02)
-    rms = float(np.sqrt(np.mean(residual[kept] ** 2)))
+    inliers = np.abs(residual) < 5 * max(1.4826 * float(np.median(np.abs(residual))), 0.02)
+    rms = float(np.sqrt(np.mean(residual[inliers] ** 2)))
     # Neighbouring edge points share pixels through the blur, about three of them each.
     jacobian = np.asarray(fit.jac)
     covariance = np.linalg.inv(jacobian.T @ jacobian) * rms**2 * 3
@@ -139,8 +139,8 @@ def _bright_contour(img: Array) -> tuple[Array, NDArray[np.bool_]]:
     mask = labels == 1 + np.argmax(np.bincount(labels.reshape(-1))[1:])
     if mask.sum() < 100:
         raise OutlineNotFound(f"the largest bright object covers {int(mask.sum())} pixels, too few for an outline")
-    whole = binary_fill_holes(mask)
-    return np.argwhere(whole & ~binary_erosion(whole)).astype(float), mask
+    filled = binary_fill_holes(mask)
+    return np.argwhere(filled & ~binary_erosion(filled)).astype(float), mask
 
 
 def _otsu(grey: NDArray[np.uint8]) -> int:

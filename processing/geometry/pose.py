@@ -55,17 +55,17 @@ def refine_pose(mesh: Mesh, camera: PinholeCamera, silhouette: ArrayLike, max_st
     OutlineNotFound
         The silhouette is empty or cut by the frame, or the start pose does not overlap it.
     """
-    seen = np.asarray(silhouette, dtype=bool)
-    if seen.shape != (camera.rows, camera.columns):
-        raise ValueError(f"silhouette {seen.shape} and camera {(camera.rows, camera.columns)} differ in size")
-    if not seen.any():
+    mask = np.asarray(silhouette, dtype=bool)
+    if mask.shape != (camera.rows, camera.columns):
+        raise ValueError(f"silhouette {mask.shape} and camera {(camera.rows, camera.columns)} differ in size")
+    if not mask.any():
         raise OutlineNotFound("the silhouette is empty: no pixel shows the object")
-    if seen[[0, -1]].any() or seen[:, [0, -1]].any():
+    if mask[[0, -1]].any() or mask[:, [0, -1]].any():
         raise OutlineNotFound("the silhouette touches the border of the frame: the outline is not whole")
-    distance = _signed_distance(seen)
+    distance = _signed_distance(mask)
     previous = np.inf
     for step in range(1, max_steps + 1):
-        rim, normal, overlap = _rim(mesh, camera, seen)
+        rim, normal, overlap = _rim(mesh, camera, mask)
         if overlap < 0.3:
             raise OutlineNotFound(
                 f"mesh and object overlap by {100 * overlap:.0f} % of the silhouette: start from a closer pose"

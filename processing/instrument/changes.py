@@ -155,8 +155,8 @@ class Changes:
 
     def key(self, element: str, azimuth_rad: Array) -> tuple[str, bytes]:
         """What the Mueller matrices of an element depend on, its own values left out."""
-        own = (self.retardance_rad, self.extinction, self.diattenuation, self.depolarization)
-        parts = (azimuth_rad, *(change[element] for change in own))
+        kinds = (self.retardance_rad, self.extinction, self.diattenuation, self.depolarization)
+        parts = (azimuth_rad, *(change[element] for change in kinds))
         return element, b"|".join(np.asarray(p, dtype=float).tobytes() for p in parts)
 
     def turn_axis(self, axis: str, error_deg: Array, elements: Mapping[str, float]) -> None:

@@ -22,8 +22,8 @@ def determined_basis(model: InstrumentModel) -> Array:
     drawn = {axis: random.uniform(0, 360, DRAWN) for axis in model.axes}
     w = ideal.rows(drawn if model.measured is None else model.measured.angles_deg).reshape(-1, 16)
     _, size, vt = np.linalg.svd(w, full_matrices=False)
-    found = np.asarray(vt[size > LEAST * size[0]].T)
-    return np.eye(16) if found.shape[1] == 16 else found
+    basis = np.asarray(vt[size > LEAST * size[0]].T)
+    return np.eye(16) if basis.shape[1] == 16 else basis
 
 
 def determined_elements(basis: Array) -> BoolArray:

@@ -56,8 +56,8 @@ class Element(Section):
         azimuth = np.full(states, number(self.azimuth_deg))
         if self.axis is not None:
             if self.axis not in angles_deg:
-                known = ", ".join(sorted(angles_deg)) or "none"
-                raise KeyError(f"element {self.name!r} turns with axis {self.axis!r}; the states have: {known}")
+                axes = ", ".join(sorted(angles_deg)) or "none"
+                raise KeyError(f"element {self.name!r} turns with axis {self.axis!r}; the states have: {axes}")
             azimuth = azimuth + self.ratio * np.asarray(angles_deg[self.axis], dtype=float)
         return np.asarray(np.deg2rad(azimuth))
 

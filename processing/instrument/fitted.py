@@ -94,11 +94,11 @@ class SystematicError(Section):
     def _read(cls, directions: Any) -> Any:
         if not isinstance(directions, list | tuple):
             return directions
-        return [_read_direction(one) if isinstance(one, Mapping) else one for one in directions]
+        return [_read_direction(direction) if isinstance(direction, Mapping) else direction for direction in directions]
 
     @field_serializer("directions", when_used="json")
     def _told(self, directions: tuple[tuple[AppliedEffect, ...], ...]) -> list[_AsWritten]:
-        return [_direction_text(effect.model_dump() for effect in one) for one in directions]
+        return [_direction_text(effect.model_dump() for effect in direction) for direction in directions]
 
 
 #: kind[element] at 662 nm in air.h5
@@ -149,4 +149,4 @@ def _number_or_text(value: float | Sequence[float]) -> float | str:
 
 
 def _numbers(value: Any) -> Any:
-    return tuple(float(one) for one in value.split()) if isinstance(value, str) else value
+    return tuple(float(number) for number in value.split()) if isinstance(value, str) else value

@@ -110,8 +110,8 @@ class Sentence:
     @property
     def text(self) -> str:
         """The sentence; it is the place of the effect in files."""
-        what = " and ".join(self.quantities)
-        return f"{what} of {self.site}" + (f" {self.course}" if self.course else "")
+        quantities = " and ".join(self.quantities)
+        return f"{quantities} of {self.site}" + (f" {self.course}" if self.course else "")
 
     @property
     def of_one_capture(self) -> bool:
@@ -120,10 +120,10 @@ class Sentence:
 
     def price(self, conditions: Conditions) -> float:
         """[log odds] Prior odds against the sentence: more for a high harmonic, and for one of many states or waves."""
-        kind, _, rest = self.course.partition(" ")
+        kind, _, wave = self.course.partition(" ")
         price = PRICE + OF_A_PART * (len({q.split()[0] for q in self.quantities}) - 1)
         if kind == "by":
-            return price + OF_A_HARMONIC * max(int(rest.split()[0]) - 2, 0)
+            return price + OF_A_HARMONIC * max(int(wave.split()[0]) - 2, 0)
         of_several = {"from": conditions.states, "beating": _beats(conditions.states).size}.get(kind, 1)
         return price + float(np.log(of_several))
 
@@ -155,14 +155,14 @@ def parsed(text: str) -> Sentence:
     ------
     KeyError : it is none.
     """
-    what, _, rest = text.partition(" of ")
-    while what not in SIZES and not all(q in SIZES for q in what.split(" and ")):
-        more, separator, rest = rest.partition(" of ")
+    quantity, _, remainder = text.partition(" of ")
+    while quantity not in SIZES and not all(q in SIZES for q in quantity.split(" and ")):
+        more, separator, remainder = remainder.partition(" of ")
         if not separator:
             raise KeyError(text)
-        what = f"{what} of {more}"
-    site, _, name = rest.partition(" ")
-    return Sentence(site, tuple(what.split(" and ")), name)
+        quantity = f"{quantity} of {more}"
+    site, _, name = remainder.partition(" ")
+    return Sentence(site, tuple(quantity.split(" and ")), name)
 
 
 def _course_names(name: str) -> tuple[str, ...]:
@@ -239,14 +239,14 @@ def _bend(changes: Changes, model: InstrumentModel, site: str, quantity: str, *,
         changes.follow(element, _exponential(value[:, None, None] * GENERATORS[quantity]))
         return
     element = site
-    found = next(e for e in model.elements() if e.name == element)
+    part = next(e for e in model.elements() if e.name == element)
     behind = any(e.name == element for e in model.generator)
-    angle = found.azimuth_rad(changes.conditions.angles_deg, changes.conditions.states)
+    angle = part.azimuth_rad(changes.conditions.angles_deg, changes.conditions.states)
     share = value[:, None, None]
     if quantity == "inner reflection":
         # Light that is sent back twice inside a plate passes it three times.
-        own = found.mueller(angle)
-        bent = np.eye(4) + share * (own @ own - np.eye(4))
+        passage = part.mueller(angle)
+        bent = np.eye(4) + share * (passage @ passage - np.eye(4))
     else:
         bent = mueller.rotation(angle) @ _exponential(share * GENERATORS[quantity]) @ mueller.rotation(-angle)
     (changes.follow if behind else changes.precede)(element, bent)
@@ -303,17 +303,17 @@ def _of_element(
 ) -> Iterator[Sentence]:
     """Of one element, which may follow the axes that light has `passed`; its own is then among them."""
     name, earlier = element.name, tuple(passed)
-    own = [element.axis] if element.axis in turning and element.axis else []
-    passed += [axis for axis in own if axis not in passed]
+    axes = [element.axis] if element.axis in turning and element.axis else []
+    passed += [axis for axis in axes if axis not in passed]
     if isinstance(element, Retarder):
-        yield from _waves(name, ("retardance",), own, (2, 3, 4))
+        yield from _waves(name, ("retardance",), axes, (2, 3, 4))
         yield from _waves(name, ("retardance",), earlier if not front else (), (1, 2))
-        yield from _waves(name, ("azimuth",), own, (3, 4))
-        yield from _waves("source", ("gain",), own, (3, 4))
-        yield from _waves(name, ("diattenuation",), own, (1, 2))
-        if own:
+        yield from _waves(name, ("azimuth",), axes, (3, 4))
+        yield from _waves("source", ("gain",), axes, (3, 4))
+        yield from _waves(name, ("diattenuation",), axes, (1, 2))
+        if axes:
             yield Sentence(name, TOGETHER)
-            yield from _waves(name, TOGETHER_TURNING, own, (1, 2))
+            yield from _waves(name, TOGETHER_TURNING, axes, (1, 2))
             yield from (Sentence(name, (quantity,)) for quantity in OF_A_PLATE)
             yield from (Sentence(name, (q,), time) for time in times[1:] for q in ("azimuth", "retardance"))
     else:

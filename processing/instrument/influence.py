@@ -51,8 +51,8 @@ def influences(
     ------
     WavelengthError : the file has no values at this wavelength.
     """
-    own = [e.wavelength_nm for e in model.effects if e.wavelength_nm is not None]
-    nm = wavelength_nm or (*(model.wavelengths_nm or ()), *own, 0.0)[0]
+    wavelengths = [e.wavelength_nm for e in model.effects if e.wavelength_nm is not None]
+    nm = wavelength_nm or (*(model.wavelengths_nm or ()), *wavelengths, 0.0)[0]
     at = model.at(nm)
     where = conditions or _some_states(at, STATES)
     out = []
@@ -65,8 +65,8 @@ def influences(
         value = _numbers(model.value_of(name), stderr)
         out.append(Influence(name, value, "later captures at all wavelengths", change, fitted=True))
     for effect in model.effects:
-        there = at if wavelength_nm or effect.wavelength_nm is None else model.at(effect.wavelength_nm)
-        out.append(Influence(_name(effect), _values(effect), _scope(effect), _change_by(there, effect, where)))
+        model_at = at if wavelength_nm or effect.wavelength_nm is None else model.at(effect.wavelength_nm)
+        out.append(Influence(_name(effect), _values(effect), _scope(effect), _change_by(model_at, effect, where)))
     return out
 
 
@@ -74,9 +74,9 @@ def _change_by(model: InstrumentModel, effect: AppliedEffect, where: Conditions)
     listed = instrument_effects().get(effect.kind)
     if effect not in model.effects or (listed is not None and listed.acts_on_counts(effect.element or "")):
         return None
-    here = effect.model_copy(update={"scope": "instrument"})
-    others = tuple(e for e in model.effects if e != effect and e.scope == "instrument")
-    return _change(model, (*others, here), others, where)
+    always = effect.model_copy(update={"scope": "instrument"})
+    remaining = tuple(e for e in model.effects if e != effect and e.scope == "instrument")
+    return _change(model, (*remaining, always), remaining, where)
 
 
 def _change(
@@ -103,9 +103,9 @@ def _change(
 
 
 def _rows(model: InstrumentModel, effects: tuple[AppliedEffect, ...], where: Conditions) -> Array:
-    other = model.model_copy(update={"effects": effects})
-    changes = changes_of(other, where)
-    return other.rows(where.angles_deg, changes)
+    variant = model.model_copy(update={"effects": effects})
+    changes = changes_of(variant, where)
+    return variant.rows(where.angles_deg, changes)
 
 
 def _some_states(model: InstrumentModel, states: int) -> Conditions:
@@ -137,10 +137,10 @@ def _numbers(value: Dispersive | None, stderr: Dispersive) -> str:
     def at(of: Dispersive | None, nm: float) -> float:
         return of.get(nm, 0.0) if isinstance(of, dict) else of or 0.0
 
-    given = sorted({nm for of in (value, stderr) if isinstance(of, dict) for nm in of})
-    told = [
-        (EffectParameter(value=at(value, nm), stderr=at(stderr, nm), unit="").told, f" at {nm:g} nm") for nm in given
+    at_nm = sorted({nm for of in (value, stderr) if isinstance(of, dict) for nm in of})
+    text = [
+        (EffectParameter(value=at(value, nm), stderr=at(stderr, nm), unit="").told, f" at {nm:g} nm") for nm in at_nm
     ]
-    if not given:
-        told = [(EffectParameter(value=at(value, 0.0), stderr=at(stderr, 0.0), unit="").told, "")]
-    return ", ".join(number + where for number, where in told)
+    if not at_nm:
+        text = [(EffectParameter(value=at(value, 0.0), stderr=at(stderr, 0.0), unit="").told, "")]
+    return ", ".join(number + where for number, where in text)

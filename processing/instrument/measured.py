@@ -68,19 +68,19 @@ class MeasuredMatrix(Section):
 
     def at(self, angles_deg: Mapping[str, ArrayLike]) -> Array:
         """Rows (states, channels, 16) of the states with these angles. Raises ProcessError."""
-        asked = {axis: np.atleast_1d(np.asarray(angles_deg[axis], dtype=float)) for axis in self.angles_deg}
-        off = np.max([np.abs(asked[axis][:, None] - column) for axis, column in self.angles_deg.items()], axis=0)
+        targets = {axis: np.atleast_1d(np.asarray(angles_deg[axis], dtype=float)) for axis in self.angles_deg}
+        off = np.max([np.abs(targets[axis][:, None] - column) for axis, column in self.angles_deg.items()], axis=0)
         nearest = off.argmin(axis=1)
         if np.any(far := ~(off.min(axis=1) <= self.tolerance_deg)):
             state = int(np.flatnonzero(far)[0])
-            place = ", ".join(f"{axis} {column[state]:g}" for axis, column in asked.items())
+            place = ", ".join(f"{axis} {column[state]:g}" for axis, column in targets.items())
             raise ProcessError(
                 f"state {state} has {place}, and W was measured at no such state within "
                 f"{self.tolerance_deg:g} degrees (or volts). Take the states of the instrument file, or measure W at "
                 "these."
             )
         rows = np.zeros((len(self.rows), 16))
-        given = np.array(self.rows)
+        matrix = np.array(self.rows)
         # A row of a Stokes polarimeter acts on the first column of M.
-        rows[:, :: 16 // given.shape[1]] = given
+        rows[:, :: 16 // matrix.shape[1]] = matrix
         return np.asarray(rows.reshape(self.states, -1, 16)[nearest])

@@ -130,12 +130,12 @@ class InstrumentModel(Section):
             return data
         if data.get("measured") is not None:
             data = {"generator": (), "analyzer": ()} | dict(data)
-        found: dict[str, Any] = {}
-        plain = {key: without_u(node, found) if key in TRAINS else node for key, node in data.items()}
-        given = plain.get("stderr") or {}
-        if not found or not isinstance(given, Mapping):
+        errors: dict[str, Any] = {}
+        plain = {key: without_u(node, errors) if key in TRAINS else node for key, node in data.items()}
+        stated = plain.get("stderr") or {}
+        if not errors or not isinstance(stated, Mapping):
             return plain
-        return plain | {"stderr": {**given, **found}}
+        return plain | {"stderr": {**stated, **errors}}
 
     @field_validator("stderr")
     @classmethod
@@ -212,13 +212,13 @@ class InstrumentModel(Section):
                 f"instrument {self.name!r} is given at {_listing(self.wavelengths_nm)} nm; "
                 f"asked for {wavelength_nm:g} nm. Use an instrument file that has it."
             )
-        given = self.model_dump()
-        given["stderr"] = {
+        fields = self.model_dump()
+        fields["stderr"] = {
             name: error
-            for name, error in given["stderr"].items()
+            for name, error in fields["stderr"].items()
             if not isinstance(error, dict) or _listed(wavelength_nm, tuple(error))
         }
-        resolved = _resolve(given, wavelength_nm, self.name)
+        resolved = _resolve(fields, wavelength_nm, self.name)
 
         def holds(found: dict[str, Any]) -> bool:
             # What was found at one wavelength is not carried over to another, unless it belongs to none.
@@ -241,11 +241,11 @@ class InstrumentModel(Section):
         values: dict[str, dict[str, Dispersive]] = {}
         for name in self.calibrate:
             element, _, field = name.rpartition(".")
-            given = self.value_of(name)
-            if isinstance(given, dict) and not _listed(wavelength_nm, tuple(given)):
-                known = sorted(given)
-                near = float(np.interp(wavelength_nm, known, [given[k] for k in known]))
-                values.setdefault(element, {})[field] = {**given, wavelength_nm: near}
+            value = self.value_of(name)
+            if isinstance(value, dict) and not _listed(wavelength_nm, tuple(value)):
+                nodes = sorted(value)
+                near = float(np.interp(wavelength_nm, nodes, [value[k] for k in nodes]))
+                values.setdefault(element, {})[field] = {**value, wavelength_nm: near}
         return self.with_values(values).at(wavelength_nm)
 
     def value_of(self, name: str) -> Dispersive | None:
@@ -284,10 +284,10 @@ class InstrumentModel(Section):
         common = [_matrices(e, angles_deg, n, changes) for e in self.analyzer]
         out = np.empty((n, len(self.channels), 4))
         for k, channel in enumerate(self.channels):
-            own = [_matrices(e, angles_deg, n, changes) for e in channel.elements]
+            matrices = [_matrices(e, angles_deg, n, changes) for e in channel.elements]
             row = np.zeros((n, 4))
             row[:, 0] = number(channel.gain)
-            for matrix in reversed(common + own):
+            for matrix in reversed(common + matrices):
                 row = np.einsum("ni,nij->nj", row, matrix)
             out[:, k] = row
         return out

@@ -57,8 +57,8 @@ def without_u(node: Any, found: dict[str, Any]) -> Any:
         if set(value) == {"value", "u"}:
             plain[field], found[f"{node.get('name')}.{field}"] = value["value"], value["u"]
             continue
-        at = {nm: one for nm, one in value.items() if isinstance(one, Mapping) and set(one) == {"value", "u"}}
+        at = {nm: entry for nm, entry in value.items() if isinstance(entry, Mapping) and set(entry) == {"value", "u"}}
         if at:
-            plain[field] = {nm: at[nm]["value"] if nm in at else one for nm, one in value.items()}
-            found[f"{node.get('name')}.{field}"] = {nm: one["u"] for nm, one in at.items()}
+            plain[field] = {nm: at[nm]["value"] if nm in at else entry for nm, entry in value.items()}
+            found[f"{node.get('name')}.{field}"] = {nm: entry["u"] for nm, entry in at.items()}
     return plain

@@ -57,14 +57,14 @@ def of_all_inputs(inputs: Sequence[tuple[str, ...]], moves: Sequence[Array]) -> 
     inputs : of each result; those of one name are one, see `InstrumentModel.identity`.
     moves : (D, ...) of each, by its own inputs.
     """
-    if all(own == inputs[0] for own in inputs):
+    if all(labels == inputs[0] for labels in inputs):
         return inputs[0], list(moves)
-    every = tuple(dict.fromkeys(name for own in inputs for name in own))
-    found = []
-    for own, moved in zip(inputs, moves, strict=True):
-        found.append(np.zeros((len(every), *moved.shape[1:])))
-        found[-1][[every.index(name) for name in own]] = moved
-    return every, found
+    every = tuple(dict.fromkeys(name for labels in inputs for name in labels))
+    aligned = []
+    for subset, moved in zip(inputs, moves, strict=True):
+        aligned.append(np.zeros((len(every), *moved.shape[1:])))
+        aligned[-1][[every.index(name) for name in subset]] = moved
+    return every, aligned
 
 
 def _moved(model: InstrumentModel, shifts: Mapping[str, float]) -> InstrumentModel:

@@ -29,17 +29,17 @@ def coherency_noise(image: MuellerImage) -> EigenvalueNoise:
     alone = process.copy()
     alone[..., 0] -= 1
     with np.errstate(divide="ignore", invalid="ignore"):
-        whole, known_m00 = image.variance_of(process), image.variance_of(alone)
+        of_process, known_m00 = image.variance_of(process), image.variance_of(alone)
         brightness = np.square(image.errors[0, 0].astype(float))
         row = image.product_of(TRIPLE, process) / m00**2
         total = np.square(image.errors).sum(axis=(0, 1)) / (4 * m00**2)
-        with_m00 = (whole - known_m00 - brightness) / (8 * m00**2)
+        with_m00 = (of_process - known_m00 - brightness) / (8 * m00**2)
         along = np.sqrt(known_m00) / (4 * m00)
-        found = EigenvalueNoise.of(
-            total, row, whole / (4 * m00) ** 2, along, m00=np.sqrt(brightness) / np.abs(m00), with_m00=with_m00
+        noise = EigenvalueNoise.of(
+            total, row, of_process / (4 * m00) ** 2, along, m00=np.sqrt(brightness) / np.abs(m00), with_m00=with_m00
         )
         below, above = _stretches(image, xi0, process)
-    return replace(found, below=below, above=above)
+    return replace(noise, below=below, above=above)
 
 
 def _stretches(

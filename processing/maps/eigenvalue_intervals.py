@@ -40,9 +40,9 @@ def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0,
     observed = np.sum(deviation**2, axis=0)
     real = np.sqrt(np.maximum(1 - noise.others / observed, 0))
     unit = np.sqrt(noise.others / 8)
-    own = planes["eigenvalue_deviation_errors"] / (np.sqrt(2 / 3) * unit)
+    spread = planes["eigenvalue_deviation_errors"] / (np.sqrt(2 / 3) * unit)
     first, second = -np.diff(xi[1:], axis=0) / unit
-    three = of_gaps(first, second, own, components)
+    three = of_gaps(first, second, spread, components)
     mean = (1 - found.xi0) / 3
     shrunk = np.stack([found.xi0, *(mean + real * deviation)])
     with_mean, without_mean = three.with_mean(found.stderr / (3 * unit)), three.with_mean(np.zeros_like(unit))
@@ -88,16 +88,16 @@ def set_entropy(planes: Planes, xi: Array, slopes: RealArray, image: MuellerImag
     bounds = planes["depolarization_index_95"].astype(float)
     off = xi - 0.25
     pattern = off / np.sqrt(4 / 3 * np.square(off).sum(axis=0))
-    rest = np.clip(xi[1:], 0, None)
-    sums = rest.sum(axis=0)
-    rest = np.where(sums > 0, rest / np.where(sums > 0, sums, 1), 1 / 3)
-    even = 1 + np.square(rest).sum(axis=0)
+    shares = np.clip(xi[1:], 0, None)
+    sums = shares.sum(axis=0)
+    shares = np.where(sums > 0, shares / np.where(sums > 0, sums, 1), 1 / 3)
+    even = 1 + np.square(shares).sum(axis=0)
 
     def at(of_index: Array) -> Array:
         # Of the light that is not in the dominant process, of a nearly pure sample, the shares stay.
         lost = 0.75 * (1 - np.square(np.clip(of_index, 0, 1)))
         lost = (1 - np.sqrt(np.maximum(1 - even * lost, 0))) / even
-        pure = np.concatenate([1 - lost[None], lost * rest])
+        pure = np.concatenate([1 - lost[None], lost * shares])
         share = np.clip((lost - PURE[0]) / (PURE[1] - PURE[0]), 0, 1)
         return entropy_of(pure + share * (0.25 + pattern * np.maximum(of_index, 0) - pure))
 
@@ -117,10 +117,10 @@ def set_entropy(planes: Planes, xi: Array, slopes: RealArray, image: MuellerImag
     low, low_95, high, high_95 = ends
     # Next to an end of its range the estimate is not the middle of the interval: a truth there has no pull of 1.
     value = np.where((low > 0) & (high < 1), (low + high) / 2, middle)
-    known = ((bounds[0] > 0) | (bounds[1] != 1)) & np.isfinite(value + low_95 + high_95)
-    error = np.where(known, np.maximum(high - value, value - low), np.fmax(np.fmax(value, 1 - value), 1 / 2))
+    is_bounded = ((bounds[0] > 0) | (bounds[1] != 1)) & np.isfinite(value + low_95 + high_95)
+    error = np.where(is_bounded, np.maximum(high - value, value - low), np.fmax(np.fmax(value, 1 - value), 1 / 2))
     without = np.isnan(image.errors[0, 0])
-    low_95, high_95 = (np.where(known, own, end) for own, end in zip((low_95, high_95), (0.0, 1.0), strict=True))
+    low_95, high_95 = (np.where(is_bounded, side, end) for side, end in zip((low_95, high_95), (0.0, 1.0), strict=True))
     put(planes, "entropy", value, *(np.where(without, np.nan, part) for part in (error, low_95, high_95)))
 
 
@@ -144,9 +144,9 @@ def set_symmetric(planes: Planes, relative: Array) -> None:
     for k, name in enumerate(names):
         mixed = near[k] | near[min(k + 1, 2)] | (np.abs(value[k + 1]) < SEEN * relative)
         spread = np.hypot(error[k + 1], np.where(mixed, (OF_NOISE if k == 0 else 2) * relative, 0))
-        known = np.isfinite(spread)
+        is_finite = np.isfinite(spread)
         bounds = value[k + 1] - NORMAL_95 * spread, value[k + 1] + NORMAL_95 * spread
-        low, high = (np.where(known, b, end) for b, end in zip(bounds, (-1.0, 1.0), strict=True))
+        low, high = (np.where(is_finite, b, end) for b, end in zip(bounds, (-1.0, 1.0), strict=True))
         put(planes, name, value[k + 1], spread, low, high)
 
 
@@ -162,8 +162,8 @@ def widen_dominant(planes: Planes, noise: EigenvalueNoise, uneven: float) -> Arr
     xi = planes["coherency_eigenvalues"].astype(float)
     gap, coupling = xi[0] - xi[1], uneven * noise.coupling
     # Two processes whose eigenvalues were equal would be seen this far apart.
-    seen = (gap + np.sqrt(gap**2 + 4 * _REPELLED * coupling**2)) / 2
-    factor = np.where(gap > SEEN * coupling, seen / gap, np.nan)
+    apparent = (gap + np.sqrt(gap**2 + 4 * _REPELLED * coupling**2)) / 2
+    factor = np.where(gap > SEEN * coupling, apparent / gap, np.nan)
     for name in [n for n in planes if n.startswith("dominant_") and not n.endswith("_errors")]:
         planes[f"{name}_errors"] = planes[f"{name}_errors"] * factor.astype(np.float32)
     return factor

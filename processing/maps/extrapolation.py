@@ -55,36 +55,36 @@ def extrapolate_mueller(
         systematic = Systematic.of_product(product)
     m0 = dominant_model(header, geometry_file, material_file, shape)
     image = StokesImage.load(source)
-    found = estimate_from_stokes(image, m0)
+    estimate = estimate_from_stokes(image, m0)
     with np.errstate(invalid="ignore"):
-        values = triply_degenerate.mueller_matrix(m0, found.xi0, found.m00)
-        errors = np.abs(m0) * found.alpha_0_stderr[..., None, None]
-    errors[..., 0, 0] = found.m00_stderr
-    valid = found.valid & ~found.unphysical
+        values = triply_degenerate.mueller_matrix(m0, estimate.xi0, estimate.m00)
+        errors = np.abs(m0) * estimate.alpha_0_stderr[..., None, None]
+    errors[..., 0, 0] = estimate.m00_stderr
+    valid = estimate.valid & ~estimate.unphysical
     facts: dict[str, Any] = {
         "method": "TD model, xi0 and M00 from the Stokes image, dominant process from the reflectance model",
         "valid_pixels": int(valid.sum()),
         "pixels": int(valid.size),
-        "median_xi0": float(np.median(found.xi0[valid])) if valid.any() else None,
-        "median_xi0_error": float(np.median(found.xi0_stderr[valid])) if valid.any() else None,
+        "median_xi0": float(np.median(estimate.xi0[valid])) if valid.any() else None,
+        "median_xi0_error": float(np.median(estimate.xi0_stderr[valid])) if valid.any() else None,
         "warnings": ["extrapolated: elements that the capture did not measure are the model's"],
     }
     planes: dict[str, NDArray[Any]] = {
         "mueller": _planar(values),
         "mueller_errors": _planar(errors),
-        "m00_correlation": found.correlation * np.sign(4 * found.xi0 - 1),
+        "m00_correlation": estimate.correlation * np.sign(4 * estimate.xi0 - 1),
         "valid": valid.astype(np.uint8),
     }
     every = PLANES
     if systematic is not None:
         fitted = np.tensordot(image.analyzers, image.values.astype(float), axes=1)
         # Of M/m00 alone: M = m00 e00 + alpha_0 (m0 - e00), and alpha_0/m00 = (4 xi0 - 1)/3.
-        moved = 4 / 3 * found.m00 * refitted(systematic, fitted, found.xi0, m0)
+        moved = 4 / 3 * estimate.m00 * refitted(systematic, fitted, estimate.xi0, m0)
         of_alpha_0 = np.sqrt(np.square(moved).sum(axis=0))
         planes["mueller_systematic"] = _planar(np.abs(m0) * of_alpha_0[..., None, None])
         planes["mueller_systematic"][0, 0] = 0.0 * of_alpha_0
         with np.errstate(divide="ignore", invalid="ignore"):
-            planes[DIRECTIONS] = moved / found.alpha_0_stderr
+            planes[DIRECTIONS] = moved / estimate.alpha_0_stderr
         every = PLANES | _systematic_planes(systematic)
         facts[INPUTS] = "; ".join(systematic.labels)
     with ProductWriter(out, EXTRAPOLATED, header, shape, planes=every, steps=steps, overwrite=overwrite) as writer:
@@ -147,17 +147,17 @@ class ExtrapolatedImage:
         """Covariance (rows, columns, 16, 16) of the elements: they have two errors."""
         common = np.moveaxis(self._signed, 0, -1)
         common[..., 0] = 0.0
-        found = common[..., :, None] * common[..., None, :]
+        result = common[..., :, None] * common[..., None, :]
         m00 = self.errors[0, 0].astype(float)
-        found[..., 0, :] = found[..., :, 0] = (self.correlation * m00)[..., None] * common
-        found[..., 0, 0] = m00**2
-        return found
+        result[..., 0, :] = result[..., :, 0] = (self.correlation * m00)[..., None] * common
+        result[..., 0, 0] = m00**2
+        return result
 
     def variance_of(self, gradient: NDArray[np.floating]) -> NDArray[np.float64]:
         """First-order variance (rows, columns) of a quantity with gradient (rows, columns, 16) by the elements."""
-        own = gradient[..., 0] * self.errors[0, 0]
+        of_m00 = gradient[..., 0] * self.errors[0, 0]
         common = np.einsum("ixy,xyi->xy", self._signed[1:], gradient[..., 1:])
-        return np.asarray(own**2 + common**2 + 2 * self.correlation * own * common)
+        return np.asarray(of_m00**2 + common**2 + 2 * self.correlation * of_m00 * common)
 
 
 def _planar(m: NDArray[np.floating]) -> NDArray[np.float32]:

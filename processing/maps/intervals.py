@@ -123,8 +123,8 @@ def set_magnitudes(
 
 def _set_angle(planes: Planes, name: str, vector: Array, covariance: Array) -> None:
     """Fieller's interval for the direction of vectors (2, ...): all directions where they may be zero."""
-    found = directions(vector, covariance, both_ends=name == EITHER_AXIS)
-    half, low, high = (np.rad2deg(part) / 2 for part in found)
+    direction = directions(vector, covariance, both_ends=name == EITHER_AXIS)
+    half, low, high = (np.rad2deg(part) / 2 for part in direction)
     value = planes[name]
     put(planes, name, value, half, value + low, value + high)
 
@@ -141,8 +141,8 @@ def set_ellipticity(planes: Planes) -> None:
     # ElementNoise is taken off the linear part: else circular light has less ellipticity than 45 degrees.
     value = np.rad2deg(0.5 * np.arctan2(circular, linear))
     square, zero = np.square(np.deg2rad(2 * planes[f"{name}_errors"].astype(float))), np.zeros(value.shape)
-    found = directions(np.stack([zero + 1, zero]), np.stack([square, square, zero]))
-    half_68, half_95 = (np.rad2deg(half) / 2 for half in (found.half, found.high))
+    direction = directions(np.stack([zero + 1, zero]), np.stack([square, square, zero]))
+    half_68, half_95 = (np.rad2deg(half) / 2 for half in (direction.half, direction.high))
     may_be_circular = planes["polarizance_linear_95"][0] == 0
     low = np.where(may_be_circular & (circular < 0), -45.0, np.maximum(value - half_95, -45.0))
     high = np.where(may_be_circular & (circular > 0), 45.0, np.minimum(value + half_95, 45.0))
@@ -179,22 +179,22 @@ def set_ratios(planes: Planes, derived: Mapping[str, Derived], image: ElementNoi
                 np.copyto(planes[f"{name}_95"], np.stack([low, high]), where=lost)
         if not some.any():
             continue
-        own = value[..., some].astype(float)
+        middle = value[..., some].astype(float)
         bent, shared = u, np.nan_to_num(np.einsum("...pk,pk->...p", quantity.gradient[..., some, :], of_m00))
         if name.endswith("_deg"):
             # No ratio to m00.
             bent, shared = np.zeros_like(u), np.zeros_like(shared)
-        low, high = whole_range(name, own)
+        low, high = whole_range(name, middle)
         half = np.max(np.abs(over_m00(np.stack([-error[..., some], error[..., some]]), bent, shared, 1.0)), axis=0)
-        everything = np.where(np.isfinite(own), np.maximum(own - low, high - own), high - low)
+        everything = np.where(np.isfinite(middle), np.maximum(middle - low, high - middle), high - low)
         error[..., some] = np.where(u < 1 / LEAST_M00, half, everything)
         if has_own_95(name):
             bounds = planes[f"{name}_95"]
             ends = bounds[..., some]
-            wide = own + over_m00(ends - own, bent, shared, NORMAL_95)
+            wide = middle + over_m00(ends - middle, bent, shared, NORMAL_95)
             # The end of a range stays.
-            kept = (ends == 0) | (ends == low) | (ends == high) | ~np.isfinite(ends) | ~np.isfinite(own)
-            bounds[..., some] = np.where(u < 1 / LEAST_M00, np.where(kept, ends, wide), np.stack([low, high]))
+            is_fixed = (ends == 0) | (ends == low) | (ends == high) | ~np.isfinite(ends) | ~np.isfinite(middle)
+            bounds[..., some] = np.where(u < 1 / LEAST_M00, np.where(is_fixed, ends, wide), np.stack([low, high]))
 
 
 def over_m00(sides: Array, u: Array, shared: Array, deviate: float) -> Array:
@@ -203,11 +203,11 @@ def over_m00(sides: Array, u: Array, shared: Array, deviate: float) -> Array:
     `shared` is the covariance of the two.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        known = 1 - np.square(deviate * u)
+        denominator = 1 - np.square(deviate * u)
         # Beyond where first order holds the gradient may be anything, but no covariance is larger than both errors.
         most = deviate * u * np.abs(sides)
         turn = np.clip(deviate**2 * shared, -most, most)
-        return np.asarray((np.sign(sides) * np.sqrt(turn**2 + sides**2 * known) - turn) / known)
+        return np.asarray((np.sign(sides) * np.sqrt(turn**2 + sides**2 * denominator) - turn) / denominator)
 
 
 def whole_range(name: str, value: Array) -> tuple[Array, Array]:
@@ -284,26 +284,26 @@ def set_retardance(
     error, linear_error : (...), of the retardance and of its linear part, to first order.
     """
     error, linear_error = error.astype(float), linear_error.astype(float)
-    whole = np.asarray(derived["retardance_deg"].value, dtype=float)
-    gap = 180 - whole
+    total = np.asarray(derived["retardance_deg"].value, dtype=float)
+    gap = 180 - total
     planes["retardance_axis_flip"] = ndtr(-gap / error).astype(np.float32)
     flips = [planes["retardance_axis_flip"] > limit for limit in FLIPPED]
-    upper = whole > 90
+    upper = total > 90
     for name, raw in (("retardance_deg", error), ("retardance_linear_deg", linear_error)):
         value = np.asarray(derived[name].value, dtype=float)
-        share = value / whole
-        one = np.square(share * error)
-        found = interval(share * gap, one, one, one**2)
+        share = value / total
+        variance = np.square(share * error)
+        of_gap = interval(share * gap, variance, variance, variance**2)
         # The part of the linear retardance: its first and, about all of it, its second order.
-        parted = np.sqrt(np.maximum(np.square(raw) - one, 0))
+        parted = np.sqrt(np.maximum(np.square(raw) - variance, 0))
         bent = np.square(NORMAL_95 * planes["retardance_circular_deg_errors"].astype(float)) / 360 * (raw is not error)
-        low, high = (np.hypot(b - found.value, NORMAL_95 * parted) for b in (found.low, found.high))
+        low, high = (np.hypot(b - of_gap.value, NORMAL_95 * parted) for b in (of_gap.low, of_gap.high))
         top = 180 * share
         folded = (
-            top - found.value,
-            np.hypot(found.error, parted),
-            top - found.value - high,
-            np.minimum(top - found.value + low + bent, 180.0),
+            top - of_gap.value,
+            np.hypot(of_gap.error, parted),
+            top - of_gap.value - high,
+            np.minimum(top - of_gap.value + low + bent, 180.0),
         )
         plain = (planes[name], planes[f"{name}_errors"], *planes[f"{name}_95"])
         everything = (plain[0], np.maximum(value, 180 - value), 0.0, 180.0)
@@ -312,9 +312,9 @@ def set_retardance(
     for name in SIGNED:
         value, spread = planes[name].astype(float), planes[f"{name}_errors"].astype(float)
         # The same retarder, turned the other way round.
-        other = value * (1 - 360 / whole)
-        half = np.where(flips[0], spread + np.abs(other - value), spread)
-        far = [np.where(flips[1], pick(value, other), value) for pick in (np.minimum, np.maximum)]
+        mirrored = value * (1 - 360 / total)
+        half = np.where(flips[0], spread + np.abs(mirrored - value), spread)
+        far = [np.where(flips[1], pick(value, mirrored), value) for pick in (np.minimum, np.maximum)]
         low, high = far[0] - NORMAL_95 * spread, far[1] + NORMAL_95 * spread
         half, low, high = (
             np.where(is_determined, a, b) for a, b in ((half, 180 + np.abs(value)), (low, -180.0), (high, 180.0))
@@ -348,12 +348,12 @@ def set_depolarization_power(planes: Planes, is_determined: NDArray[np.bool_]) -
     name = "depolarization_power"
     value = planes[name].astype(float)
     unit = np.sqrt(3) * planes[f"{name}_errors"].astype(float)
-    found = sum_of_singular_values(3 * (1 - value), unit)
+    total = sum_of_singular_values(3 * (1 - value), unit)
     chosen = (
-        (1 - found.value / 3, value),
-        (found.error / 3, np.maximum(value, 1 - value)),
-        (1 - found.high / 3, 0.0),
-        (1 - found.low / 3, 1.0),
+        (1 - total.value / 3, value),
+        (total.error / 3, np.maximum(value, 1 - value)),
+        (1 - total.high / 3, 0.0),
+        (1 - total.low / 3, 1.0),
     )
     put(planes, name, *(np.where(is_determined, a, b) for a, b in chosen))
 
@@ -363,10 +363,10 @@ def set_differential(planes: Planes, is_determined: NDArray[np.bool_]) -> None:
     for short in DIFFERENTIAL:
         name = f"differential_{short}"
         value, error = planes[name].astype(float), planes[f"{name}_errors"].astype(float)
-        known = planes.get(f"{name}_95", np.stack([value - NORMAL_95 * error, value + NORMAL_95 * error]))
+        bounds = planes.get(f"{name}_95", np.stack([value - NORMAL_95 * error, value + NORMAL_95 * error]))
         low, high = whole_range(name, value)
         half = np.where(is_determined, error, np.maximum(value - low, high - value))
-        put(planes, name, value, half, *np.where(is_determined, known, np.stack([low, high])))
+        put(planes, name, value, half, *np.where(is_determined, bounds, np.stack([low, high])))
 
 
 def set_any_dominant(planes: Planes, derived: Mapping[str, Derived], is_determined: NDArray[np.bool_]) -> None:

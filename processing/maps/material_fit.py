@@ -75,9 +75,9 @@ def fit_products(
             wavelengths.add(product.header.wavelength_nm)
             if product.header.omega_deg is None:
                 raise ProcessError(f"{source}: the capture does not say its arm angle.")
-    for what, values in (("kinds", kinds), ("wavelengths", wavelengths)):
+    for name, values in (("kinds", kinds), ("wavelengths", wavelengths)):
         if len(values) > 1:
-            raise ProcessError(f"one fit takes products of one of these {what} only: {sorted(map(str, values))}")
+            raise ProcessError(f"one fit takes products of one of these {name} only: {sorted(map(str, values))}")
     if len(simulated) > 1:
         raise ProcessError("simulated and measured products were given together; fit them one by one.")
     view = ViewingGeometry.load(geometry_file)
@@ -122,8 +122,8 @@ def _of_mueller(source: Path, view: ViewingGeometry) -> _Data:
             if image.sent is None:
                 moved.append((values + move.reshape(16, -1)[image.seen], rows))
             else:
-                seen = sent_parts(image.sent)
-                moved.append((values + move[seen, 0], sent_rows(direction.rows)[seen]))
+                is_sent = sent_parts(image.sent)
+                moved.append((values + move[is_sent, 0], sent_rows(direction.rows)[is_sent]))
     return _Data(points, values, rows, covariance_by_light(image, rows), inputs, moved)
 
 
@@ -134,8 +134,8 @@ def determined_values(image: MuellerImage) -> tuple[NDArray[np.float64], NDArray
     """
     if image.sent is None:
         return image.values.reshape(16, -1)[image.seen].astype(float), np.eye(16)[image.seen]
-    seen = sent_parts(image.sent)
-    return image.sent.reshape(4, -1)[seen].astype(float), sent_rows(image.w)[seen]
+    is_sent = sent_parts(image.sent)
+    return image.sent.reshape(4, -1)[is_sent].astype(float), sent_rows(image.w)[is_sent]
 
 
 def covariance_by_light(image: MuellerImage, rows: NDArray[np.float64]) -> NDArray[np.float64]:

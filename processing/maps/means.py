@@ -108,7 +108,7 @@ class MeanValue:
     @property
     def budget_lines(self) -> list[tuple[str, ...]]:
         """A line of text for each input, the largest first, by `BUDGET_COLUMNS`; last the combined uncertainty."""
-        whole = Contribution("combined standard uncertainty", self.u, self.degrees_of_freedom)
+        total = Contribution("combined standard uncertainty", self.u, self.degrees_of_freedom)
         return [
             (
                 part.source,
@@ -118,7 +118,7 @@ class MeanValue:
                 f"{100 * part.u**2 / self.u**2 if self.u else 0.0:.1f} %",
                 f"{part.degrees_of_freedom:.3g}",
             )
-            for part in [*sorted(self.budget, key=lambda part: -part.u), whole]
+            for part in [*sorted(self.budget, key=lambda part: -part.u), total]
         ]
 
 
@@ -148,9 +148,7 @@ def mean_of(sources: Sequence[Path], region: Region) -> list[MeanValue]:
             )
     together = _together(means)
     each = [mean.numbers() for mean in means] if len(means) > 1 else []
-    return [
-        _value(name, one, [e[name].value for e in each], together.inputs) for name, one in together.numbers().items()
-    ]
+    return [_value(name, n, [e[name].value for e in each], together.inputs) for name, n in together.numbers().items()]
 
 
 class _Number(NamedTuple):
@@ -199,13 +197,13 @@ class _Mean:
                 values = stokes.values.reshape(3, 1)
                 moved = () if systematic is None else list(systematic.moves(values))
                 return cls(stokes, np.reshape(moved, (len(inputs), 3, 1, 1)), inputs)
-            whole = MuellerImage.of(product, rows)
-            errors = product.get("stokes_errors", rows) if whole.sent is not None else None
-        image = _mueller_mean(light_of(whole, errors), columns, source)
+            full = MuellerImage.of(product, rows)
+            errors = product.get("stokes_errors", rows) if full.sent is not None else None
+        image = _mueller_mean(light_of(full, errors), columns, source)
         if systematic is None:
             return cls(image, np.zeros((0, 16, 1, 1)), inputs)
         # What was fitted is the light where no element is determined alone.
-        fitted = image if whole.sent is None else replace(whole, sent=image.values[:, 0], mask=image.mask)
+        fitted = image if full.sent is None else replace(full, sent=image.values[:, 0], mask=image.mask)
         return cls(image, moves_of_light(systematic, fitted), inputs)
 
     def numbers(self) -> dict[str, _Number]:
@@ -251,9 +249,9 @@ def _stokes_mean(image: StokesImage, columns: slice, correlation_s0: Array, sour
     good = _good(image.mask[:, columns], values, source)
     count = int(good.sum())
     kernels = (correlation_s0, image.neighbour_correlation, image.neighbour_correlation)
-    own = np.array([_variance_of_sum(np.sqrt(covariance[..., k, k]), good, kernel) for k, kernel in enumerate(kernels)])
+    var = np.array([_variance_of_sum(np.sqrt(covariance[..., k, k]), good, kernel) for k, kernel in enumerate(kernels)])
     plain = covariance[good].sum(axis=0)
-    wider = np.sqrt(own / np.diag(plain))
+    wider = np.sqrt(var / np.diag(plain))
     return replace(
         image,
         values=values[:, good].mean(axis=1).reshape(3, 1, 1),
@@ -275,15 +273,15 @@ def _together(means: Sequence[_Mean]) -> _Mean:
     values = np.mean([c * mean.image.values for c, mean in zip(scale, means, strict=True)], axis=0)
     u_of = {name: u for mean in means for name, u in mean.inputs}
     names, moved = of_all_inputs([tuple(name for name, _ in mean.inputs) for mean in means], [m.moves for m in means])
-    moves = np.mean([c * one for c, one in zip(scale, moved, strict=True)], axis=0)
+    moves = np.mean([c * move for c, move in zip(scale, moved, strict=True)], axis=0)
     first, image = replace(first, inputs=tuple((name, u_of[name]) for name in names)), first.image
     if isinstance(image, StokesImage):
         pairs = [(c, m.image) for c, m in zip(scale, means, strict=True) if isinstance(m.image, StokesImage)]
-        covariances = [c**2 * other.covariance for c, other in pairs]
+        covariances = [c**2 * part.covariance for c, part in pairs]
         covariance = np.sum(covariances, axis=0) / count**2
         return replace(first, image=replace(image, values=values, covariance=covariance), moves=moves)
     same = [(c, m.image) for c, m in zip(scale, means, strict=True) if isinstance(m.image, MuellerImage)]
-    variance = np.sum([np.square(c * other.errors) for c, other in same], axis=0)
+    variance = np.sum([np.square(c * part.errors) for c, part in same], axis=0)
     image = replace(
         image,
         values=values.astype(np.float32),
@@ -299,22 +297,22 @@ def _together(means: Sequence[_Mean]) -> _Mean:
 def _stokes_numbers(image: StokesImage, moves: Array) -> dict[str, _Number]:
     s, c = image.values.reshape(3).astype(float), image.covariance.reshape(3, 3)
     none = np.zeros(len(moves))
-    found = {"s0": _Number(s[0], float(np.sqrt(c[0, 0])), none, "count")}
+    numbers = {"s0": _Number(s[0], float(np.sqrt(c[0, 0])), none, "count")}
     for k in (1, 2):
         ratio = s[k] / s[0]
         error = np.sqrt(c[k, k] - 2 * ratio * c[0, k] + ratio**2 * c[0, 0]) / s[0]
-        found[f"s{k}_over_s0"] = _Number(ratio, float(error), moves[:, k] / s[0])
+        numbers[f"s{k}_over_s0"] = _Number(ratio, float(error), moves[:, k] / s[0])
     packed = np.array([c[0, 0], c[1, 1], c[2, 2], c[0, 1], c[0, 2], c[1, 2]])
     light = linear_polarization(s[:1], s[1:2], s[2:], packed[:, None])
     for name, moved in zip(("dolp", "aolp_deg"), moved_polarization(s, moves), strict=True):
         value, error, ends = (light[f"{name}{part}"].reshape(-1) for part in ("", "_errors", "_95"))
         unit = "degree" if name == "aolp_deg" else ""
-        found[name] = _Number(float(value[0]), float(error[0]), moved, unit, ends)
-    return found
+        numbers[name] = _Number(float(value[0]), float(error[0]), moved, unit, ends)
+    return numbers
 
 
 def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
-    found, m = {}, image.values.reshape(16).astype(float)
+    numbers, m = {}, image.values.reshape(16).astype(float)
     light = is_first_column(image.seen)
     for k in np.flatnonzero(image.seen).tolist():
         gradient = np.zeros(16)
@@ -329,7 +327,7 @@ def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
             name, unit = ("s0", "count") if k == 0 else (f"s{k // 4}_over_s0", "")
         else:
             name, unit = ("m00", "count") if k == 0 else (f"m{k // 4}{k % 4}_over_m00", "")
-        found[name] = _Number(float(value), error, moved, unit)
+        numbers[name] = _Number(float(value), error, moved, unit)
     by_input: dict[str, NDArray[Any]] = {}
     # Intervals by noise alone first: those of the second are wider by the instrument's uncertainty.
     if image.seen.all():
@@ -350,9 +348,9 @@ def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
         unit = "degree" if name.endswith("_deg") else ""
         for j, (value, error) in enumerate(zip(values, errors, strict=True)):
             label = name if len(values) == 1 else f"{name}_{j}"
-            own = None if ends is None else ends[:, j]
-            found[label] = _Number(value, error, by_input[name].reshape(len(values), -1)[j].astype(float), unit, own)
-    return found
+            end = None if ends is None else ends[:, j]
+            numbers[label] = _Number(value, error, by_input[name].reshape(len(values), -1)[j].astype(float), unit, end)
+    return numbers
 
 
 def _value(name: str, one: _Number, own: Sequence[float], inputs: Inputs) -> MeanValue:
@@ -372,12 +370,12 @@ def _value(name: str, one: _Number, own: Sequence[float], inputs: Inputs) -> Mea
     for (label, u), moved in zip(inputs, one.moved.tolist(), strict=True):
         budget.append(Contribution(label, abs(moved), np.inf, u, moved / u))
     systematic = float(np.sqrt(np.sum(np.square(one.moved))))
-    found = MeanValue(name, one.unit, one.value, one.error, systematic, scatter, np.nan, np.nan, tuple(budget))
-    half = found.k * found.u
+    mean = MeanValue(name, one.unit, one.value, one.error, systematic, scatter, np.nan, np.nan, tuple(budget))
+    half = mean.k * mean.u
     low, high = one.value - half, one.value + half
     if one.ends is not None:
         more = max(half**2 - (NORMAL_95 * one.error) ** 2, 0.0)
         low = one.value - float(np.sqrt((one.value - one.ends[0]) ** 2 + more))
         high = one.value + float(np.sqrt((one.ends[1] - one.value) ** 2 + more))
         low = max(low, 0.0) if one.ends[0] == 0 else low
-    return replace(found, low=low, high=high)
+    return replace(mean, low=low, high=high)

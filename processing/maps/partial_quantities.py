@@ -57,22 +57,22 @@ def partial_block(
     """
     # What was not determined is not in any of them.
     m = np.where(image.seen.reshape(4, 4), image.matrices.astype(float), 0.0)
-    found: dict[str, NDArray[Any]] = {}
+    planes: dict[str, NDArray[Any]] = {}
     with np.errstate(divide="ignore", invalid="ignore"):
         derived = gradients.diattenuation(m) | gradients.polarizance(m) | gradients.pairs(m, pairs)
         derived |= gradients.ellipticity(m)
         for name in names:
-            found[name] = derived[name].value.astype(np.float32)
-            found[f"{name}_errors"] = np.sqrt(image.variance_of(derived[name].gradient)).astype(np.float32)
-        set_magnitudes(found, derived, m, image)
-        set_ellipticity(found)
-        set_ratios(found, derived, image, m[..., 0, 0])
+            planes[name] = derived[name].value.astype(np.float32)
+            planes[f"{name}_errors"] = np.sqrt(image.variance_of(derived[name].gradient)).astype(np.float32)
+        set_magnitudes(planes, derived, m, image)
+        set_ellipticity(planes)
+        set_ratios(planes, derived, image, m[..., 0, 0])
         if moves is not None:
-            moved = set_systematic(found, {name: derived[name] for name in names}, moves)
+            moved = set_systematic(planes, {name: derived[name] for name in names}, moves)
             if by_input is not None:
                 by_input |= moved
-    found["lit"] = is_lit(image.values[0, 0], image.errors[0, 0]).astype(np.uint8)
-    return found
+    planes["lit"] = is_lit(image.values[0, 0], image.errors[0, 0]).astype(np.uint8)
+    return planes
 
 
 def partial_facts(writer: ProductWriter, names: list[str]) -> dict[str, Any]:
@@ -86,7 +86,7 @@ def partial_facts(writer: ProductWriter, names: list[str]) -> dict[str, Any]:
     }
     for name in names:
         for part in (name, *(f"{name}_{end}" for end in ("errors", "systematic") if f"{name}_{end}" in writer.planes)):
-            known = writer.get(part)[lit]
-            known = known[np.isfinite(known)]
-            facts[f"median_{part.replace('_errors', '_error')}"] = float(np.median(known)) if known.size else None
+            values = writer.get(part)[lit]
+            values = values[np.isfinite(values)]
+            facts[f"median_{part.replace('_errors', '_error')}"] = float(np.median(values)) if values.size else None
     return facts

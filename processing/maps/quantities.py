@@ -122,19 +122,19 @@ def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
         )
     product.require("mueller", EXTRAPOLATED)
     systematic = Systematic.of_product(product) if product.kind == "mueller" else None
-    told = {INPUTS: product.facts[INPUTS]} if INPUTS in product.facts else {}
+    inputs = {INPUTS: product.facts[INPUTS]} if INPUTS in product.facts else {}
     if is_stokes_vector(product) and not extra:
         light = light_planes(product)
         own_95 = {name for name, of_matrices in OF_MATRICES.items() if has_own_95(of_matrices)}
         planes = with_errors(
             {name: plane for name, plane in light.items() if name != "stokes_covariance"},
             lambda name: name in own_95,
-            systematic=bool(told),
+            systematic=bool(inputs),
         )
         return _Maps(
             planes | {"stokes_covariance": light["stokes_covariance"]},
             lambda rows: light_block(product, rows, systematic),
-            lambda writer: light_facts(writer, product, light) | told,
+            lambda writer: light_facts(writer, product, light) | inputs,
         )
     maps = planes_of(extra, pairs)
     partial = _determined(product, extra, pairs)
@@ -148,14 +148,14 @@ def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
 
     if partial:
         return _Maps(
-            with_errors({name: maps[name] for name in [*partial, "lit"]}, systematic=bool(told)),
+            with_errors({name: maps[name] for name in [*partial, "lit"]}, systematic=bool(inputs)),
             block,
-            lambda writer: partial_facts(writer, partial) | told,
+            lambda writer: partial_facts(writer, partial) | inputs,
         )
     return _Maps(
-        with_errors(maps, systematic=bool(told)) | NOISE,
+        with_errors(maps, systematic=bool(inputs)) | NOISE,
         block,
-        lambda writer: _facts(writer, maps) | told,
+        lambda writer: _facts(writer, maps) | inputs,
     )
 
 
@@ -215,30 +215,30 @@ def quantities_block(
             derived |= gradients.symmetric_quantities(lit)
         if "differential" in extra:
             derived |= gradients.differential_quantities(lit)
-        found: dict[str, NDArray[Any]] = {}
+        planes: dict[str, NDArray[Any]] = {}
         for name, quantity in derived.items():
             value, gradient = quantity.value, quantity.gradient
-            found[name] = value.astype(np.float32)
+            planes[name] = value.astype(np.float32)
             each = gradient.reshape(-1, *m.shape[:2], 16)
             errors = [np.sqrt(image.variance_of(g)) for g in each]
-            found[f"{name}_errors"] = np.stack(errors).reshape(value.shape).astype(np.float32)
+            planes[f"{name}_errors"] = np.stack(errors).reshape(value.shape).astype(np.float32)
         vector = derived["retardance_vector_deg"]
         retardance = of_slopes(image.covariance(), vector.value, vector.gradient)
-        found["retardance_vector_covariance"] = retardance.packed[[0, 1, 2, 3, 5, 4]].astype(np.float32)
+        planes["retardance_vector_covariance"] = retardance.packed[[0, 1, 2, 3, 5, 4]].astype(np.float32)
         polar = lu_chipman(m)
-        _set_intervals(found, derived, m, image, depolarizer=polar.depolarizer, retardance=retardance)
+        _set_intervals(planes, derived, m, image, depolarizer=polar.depolarizer, retardance=retardance)
         if moves is not None:
-            moved = set_systematic(found, derived, moves)
+            moved = set_systematic(planes, derived, moves)
             if by_input is not None:
                 by_input |= moved
-    found["lit"] = np.isfinite(lit[..., 0, 0]).astype(np.uint8)
-    found["lu_chipman_defined"] = polar.defined.astype(np.uint8)
-    found["negative_determinant"] = polar.negative_determinant.astype(np.uint8)
+    planes["lit"] = np.isfinite(lit[..., 0, 0]).astype(np.uint8)
+    planes["lu_chipman_defined"] = polar.defined.astype(np.uint8)
+    planes["negative_determinant"] = polar.negative_determinant.astype(np.uint8)
     if "symmetric" in extra:
-        found["symmetric_defined"] = symmetric(lit).defined.astype(np.uint8)
+        planes["symmetric_defined"] = symmetric(lit).defined.astype(np.uint8)
     if "differential" in extra:
-        found["differential_defined"] = differential(lit).defined.astype(np.uint8)
-    return found
+        planes["differential_defined"] = differential(lit).defined.astype(np.uint8)
+    return planes
 
 
 def _set_intervals(
@@ -298,9 +298,9 @@ def _symmetric_eigenvalues(a: NDArray[np.floating]) -> NDArray[np.float64]:
     Good to half the digits where two are equal, which is plenty for a limit.
     """
     mean = np.trace(a, axis1=-2, axis2=-1) / 3
-    rest = a - mean[..., None, None] * np.eye(3)
-    size = np.sqrt(np.einsum("...ij,...ij->...", rest, rest) / 6)
-    x, y, z = rest[..., 0, :], rest[..., 1, :], rest[..., 2, :]
+    deviator = a - mean[..., None, None] * np.eye(3)
+    size = np.sqrt(np.einsum("...ij,...ij->...", deviator, deviator) / 6)
+    x, y, z = deviator[..., 0, :], deviator[..., 1, :], deviator[..., 2, :]
     determinant = np.einsum("...i,...i->...", x, np.cross(y, z))
     turn = np.arccos(np.clip(np.nan_to_num(determinant / (2 * size**3)), -1, 1)) / 3
     return np.stack([mean + 2 * size * np.cos(turn + 2 * np.pi * k / 3) for k in range(3)])
@@ -315,9 +315,9 @@ def _relative_error(image: MuellerImage | ExtrapolatedImage) -> NDArray[np.float
 
 def _facts(writer: ProductWriter, maps: Mapping[str, Plane]) -> dict[str, Any]:
     xi, xi_errors = writer.get("coherency_eigenvalues"), writer.get("coherency_eigenvalues_errors")
-    known = writer.get("lit") > 0
-    facts: dict[str, Any] = {"pixels": int(known.size), "pixels_with_light": int(known.sum()), "warnings": []}
-    if not known.any():
+    lit = writer.get("lit") > 0
+    facts: dict[str, Any] = {"pixels": int(lit.size), "pixels_with_light": int(lit.sum()), "warnings": []}
+    if not lit.any():
         facts["warnings"].append(
             f"no pixel has m00 above {LIT_ERRORS:g} of its standard errors: there is nothing but noise"
         )
@@ -325,25 +325,25 @@ def _facts(writer: ProductWriter, maps: Mapping[str, Plane]) -> dict[str, Any]:
     names = ("depolarization_index", "entropy", "td_missed", "diattenuation_linear", "polarizance_linear")
     # Of the same pixels as in `process xi0`; without standard errors all that have light.
     valid = writer.get("valid") > 0
-    valid = valid if valid.any() else known
+    valid = valid if valid.any() else lit
     facts["median_xi0"], facts["median_xi0_error"] = _median(xi[0][valid]), _median(xi_errors[0][valid])
     for name in names:
-        facts[f"median_{name}"] = _median(writer.get(name)[known])
-        facts[f"median_{name}_error"] = _median(writer.get(f"{name}_errors")[known])
+        facts[f"median_{name}"] = _median(writer.get(name)[lit])
+        facts[f"median_{name}_error"] = _median(writer.get(f"{name}_errors")[lit])
     if "entropy_systematic" in writer.planes:
         facts["median_xi0_systematic"] = _median(writer.get("coherency_eigenvalues_systematic")[0][valid])
-        facts |= {f"median_{name}_systematic": _median(writer.get(f"{name}_systematic")[known]) for name in names}
+        facts |= {f"median_{name}_systematic": _median(writer.get(f"{name}_systematic")[lit]) for name in names}
     for name in maps:
         if name.endswith("_defined") or name == "negative_determinant":
-            facts[f"pixels_{name}"] = int(np.sum(writer.get(name)[known]))
-    if not np.isfinite(writer.get("polarizance_circular_errors")[known]).any():
+            facts[f"pixels_{name}"] = int(np.sum(writer.get(name)[lit]))
+    if not np.isfinite(writer.get("polarizance_circular_errors")[lit]).any():
         facts["warnings"].append("the product holds no standard errors, so neither do the maps")
         return facts
-    unphysical = (xi[3] < -3 * xi_errors[3]) & known
+    unphysical = (xi[3] < -3 * xi_errors[3]) & lit
     facts["pixels_unphysical_beyond_3_errors"] = int(unphysical.sum())
-    if unphysical.sum() > 0.01 * known.sum():
+    if unphysical.sum() > 0.01 * lit.sum():
         facts["warnings"].append(
-            f"{100 * unphysical.sum() / known.sum():.1f} % of the lit pixels have a negative eigenvalue beyond three "
+            f"{100 * unphysical.sum() / lit.sum():.1f} % of the lit pixels have a negative eigenvalue beyond three "
             "of its errors: noise does not make that, an instrument error does. Run `diagnose`."
         )
     return facts

@@ -70,22 +70,22 @@ NOISE = {
 
 def planes_of(extra: Sequence[str], pairs: Pairs) -> dict[str, Plane]:
     """Planes of the maps of whole matrices, without those of their errors."""
-    found = dict(_MAPS)
+    maps = dict(_MAPS)
     for scalar in scalar_quantities().values():
-        found[scalar.name] = Plane((), scalar.units, scalar.title)
+        maps[scalar.name] = Plane((), scalar.units, scalar.title)
     for name, (generator, analyzer) in pairs.items():
-        found[name] = Plane((), "", f"light from a {generator} generator through a {analyzer} analyzer, over m00")
+        maps[name] = Plane((), "", f"light from a {generator} generator through a {analyzer} analyzer, over m00")
     defined = ["lu_chipman", *extra]
     if "symmetric" in extra:
-        found |= _SYMMETRIC
+        maps |= _SYMMETRIC
     if "differential" in extra:
-        found |= _DIFFERENTIAL
+        maps |= _DIFFERENTIAL
     for name in defined:
-        found[f"{name}_defined"] = Plane((), "", f"1 = the {name.replace('_', '-')} decomposition exists", np.uint8)
-    found["valid"] = VALID
-    found["lit"] = Plane((), "", f"1 = m00 is above {LIT_ERRORS:g} of its standard errors", np.uint8)
-    found["negative_determinant"] = Plane((), "", "1 = det M < 0: Lu-Chipman's depolarizer is negative there", np.uint8)
-    return found
+        maps[f"{name}_defined"] = Plane((), "", f"1 = the {name.replace('_', '-')} decomposition exists", np.uint8)
+    maps["valid"] = VALID
+    maps["lit"] = Plane((), "", f"1 = m00 is above {LIT_ERRORS:g} of its standard errors", np.uint8)
+    maps["negative_determinant"] = Plane((), "", "1 = det M < 0: Lu-Chipman's depolarizer is negative there", np.uint8)
+    return maps
 
 
 def with_errors(

@@ -89,11 +89,11 @@ def moves_of_light(systematic: Systematic, image: MuellerImage) -> NDArray[np.fl
 
 def light_planes(product: Product) -> dict[str, Plane]:
     """The maps, without their errors, of a product for which `is_stokes_vector` holds."""
-    seen = seen_elements(product.facts)
+    is_determined = seen_elements(product.facts)
     if "stokes" in product.names:
-        seen = np.zeros(16, dtype=bool)
-        seen[::4] = sent_parts(product.get("stokes"))
-    names = [NAMES[name] for name in light_quantities(seen)]
+        is_determined = np.zeros(16, dtype=bool)
+        is_determined[::4] = sent_parts(product.get("stokes"))
+    names = [NAMES[name] for name in light_quantities(is_determined)]
     stokes = Plane((4,), "count", f"Stokes vector, S1 {_AXIS}, S3 positive: right circular; NaN: not determined")
     return {"stokes": stokes, **dict(names), "stokes_covariance": _COVARIANCE, "lit": _LIT}
 
@@ -106,13 +106,13 @@ def light_quantities(seen: BoolArray) -> list[str]:
 
 def light_block(product: Product, rows: slice, systematic: Systematic | None = None) -> dict[str, NDArray[Any]]:
     """The maps with their errors for some rows; noise taken off magnitudes, errors NaN where not determined."""
-    whole = MuellerImage.of(product, rows)
-    image = light_of(whole, product.get("stokes_errors", rows) if "stokes" in product.names else None)
-    moves = None if systematic is None else moves_of_light(systematic, whole)
+    matrices = MuellerImage.of(product, rows)
+    image = light_of(matrices, product.get("stokes_errors", rows) if "stokes" in product.names else None)
+    moves = None if systematic is None else moves_of_light(systematic, matrices)
     out: dict[str, NDArray[Any]] = {"stokes": image.values[:, 0], "stokes_errors": image.errors[:, 0]}
     covariance = image.covariance()[..., ::4, ::4]
-    seen = image.seen[::4]
-    covariance = np.where(np.outer(seen, seen), covariance, np.nan)
+    is_determined = image.seen[::4]
+    covariance = np.where(np.outer(is_determined, is_determined), covariance, np.nan)
     out["stokes_covariance"] = np.moveaxis(covariance[..., _PACKED[0], _PACKED[1]], -1, 0).astype(np.float32)
     if moves is not None:
         out["stokes_systematic"] = np.sqrt(np.square(moves[:, ::4]).sum(axis=0)).astype(np.float32)
@@ -121,8 +121,8 @@ def light_block(product: Product, rows: slice, systematic: Systematic | None = N
 
 def named(planes: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Planes of the polarizance under the names that they have here."""
-    own = {name + suffix: NAMES[name][0] + suffix for name in NAMES for suffix in ("", *COMPANIONS)}
-    return {own.get(name, name): plane for name, plane in planes.items()}
+    new_names = {name + suffix: NAMES[name][0] + suffix for name in NAMES for suffix in ("", *COMPANIONS)}
+    return {new_names.get(name, name): plane for name, plane in planes.items()}
 
 
 def light_facts(writer: ProductWriter, product: Product, planes: dict[str, Plane]) -> dict[str, Any]:

@@ -96,20 +96,20 @@ def _shares(left: Array, right: Array) -> dict[tuple[int, int], Array]:
 
 def _turned(values: NDArray[np.floating], share: Mapping[tuple[int, int], Array]) -> Array:
     """Elements (16, N) in turned axes."""
-    found = np.zeros(values.shape)
+    elements = np.zeros(values.shape)
     for (k, i), part in share.items():
-        found[k] += part * values[i]
-    return found
+        elements[k] += part * values[i]
+    return elements
 
 
 def _turned_variance(image: MuellerImage, share: Mapping[tuple[int, int], Array]) -> Array:
     """Variance (16, N) of the elements in turned axes."""
     pairs = [pair for group in _MIXED for pair in combinations_with_replacement(group, 2)]
-    found = np.zeros((16, image.mask.size))
+    variance = np.zeros((16, image.mask.size))
     for (i, j), between in zip(pairs, image.covariances_between(pairs), strict=True):
         for k in next(group for group in _MIXED if i in group):
-            found[k] += (1 + (i != j)) * share[k, i] * share[k, j] * between
-    return found
+            variance[k] += (1 + (i != j)) * share[k, i] * share[k, j] * between
+    return variance
 
 
 def _table_for(product: Product, layout: Layout, white: WhiteReference | None) -> ScatteringTable:
@@ -179,11 +179,11 @@ def tabulate(
     view = ViewingGeometry.load(geometry_file)
     for done, source in enumerate(sources, 1):
         with Product(source) as product:
-            own = _table_for(product, layout, white)
-            table = own if table is None else table
-            _require_alike(source, own, table)
+            new = _table_for(product, layout, white)
+            table = new if table is None else table
+            _require_alike(source, new, table)
             # The images of another instrument go through a table of its own.
-            target = table if own.inputs == table.inputs else own
+            target = table if new.inputs == table.inputs else new
             kind, omega_deg = product.kind, float(product.header.omega_deg or 0.0)
             # Neighbours share noise across the borders of blocks.
             blocks = product.row_blocks() if kind == "mueller" else [slice(0, product.shape[0])]

@@ -88,8 +88,8 @@ class WhiteReference(NamedTuple):
         with Product(plaque) as product:
             product.require("mueller")
             exposure, nm = exposure_of(product), product.header.wavelength_nm
-            known = [c for key, c in certificate.reflectance.items() if abs(key - nm) <= 0.5]
-            if not known:
+            entries = [c for key, c in certificate.reflectance.items() if abs(key - nm) <= 0.5]
+            if not entries:
                 stated = ", ".join(f"{key:g}" for key in certificate.reflectance)
                 raise ProcessError(f"{certificate_file} is for {stated} nm and {plaque} at {nm:g} nm.")
             if product.header.omega_deg is None:
@@ -113,7 +113,7 @@ class WhiteReference(NamedTuple):
         # Of each pixel, for light along its normal.
         level = m00 / cosines[0] / exposure
         spread = np.var(level) - np.nanmean(np.square(noise / cosines[0] / exposure))
-        brdf, of_certificate = known[0].value / np.pi / level.mean(), known[0].u / known[0].value
+        brdf, of_certificate = entries[0].value / np.pi / level.mean(), entries[0].u / entries[0].value
         return cls(brdf, float(np.sqrt(of_certificate**2 + max(spread, 0.0) / level.mean() ** 2)), alike)
 
     def factor(self, product: Product, image: GeometryImage) -> Array:

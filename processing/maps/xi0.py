@@ -89,10 +89,10 @@ def xi0_of_mueller(
             for rows in product.row_blocks():
                 if rows.stop > writer.rows_done:
                     image = MuellerImage.of(product, rows)
-                    found = eigenvalue_block(image)
+                    block = eigenvalue_block(image)
                     if systematic is not None:
-                        set_xi0_systematic(found, moved_xi0(systematic, image))
-                    writer.write(rows, **found)
+                        set_xi0_systematic(block, moved_xi0(systematic, image))
+                    writer.write(rows, **block)
                 if progress:
                     progress(rows.stop, product.shape[0])
             valid = writer.get("valid") > 0
@@ -109,26 +109,26 @@ def eigenvalue_block(image: MuellerImage) -> dict[str, NDArray[Any]]:
     """Planes `MUELLER_PLANES` of an image, or of some rows of it."""
     eigenvalues = coherency_eigenvalues(image.matrices)
     noise = coherency_noise(image)
-    found = corrected(eigenvalues.astype(float), noise, image.covariance_of_depolarizer())
+    result = corrected(eigenvalues.astype(float), noise, image.covariance_of_depolarizer())
     intervals = {}
     # What a noisy m00 does to the ratio beyond first order.
-    shared = noise.with_m00 - (found.xi0 - 0.25) * noise.m00**2
-    for name, ends, deviate in (("xi0_68", found.interval_68, 1.0), ("xi0_95", found.interval_95, NORMAL_95)):
-        wide = found.xi0 + over_m00(ends - found.xi0, noise.m00, shared, deviate)
+    shared = noise.with_m00 - (result.xi0 - 0.25) * noise.m00**2
+    for name, ends, deviate in (("xi0_68", result.interval_68, 1.0), ("xi0_95", result.interval_95, NORMAL_95)):
+        wide = result.xi0 + over_m00(ends - result.xi0, noise.m00, shared, deviate)
         wide = np.where(noise.m00 > UNEVEN, wide, ends)
         unknown = (noise.m00 > 1 / LEAST_M00) | (image.values[0, 0] <= 0)
         intervals[name] = np.where(unknown, np.array([0.25, 1.0])[:, None, None], wide)
-    known = np.isfinite(found.xi0)
+    is_known = np.isfinite(result.xi0)
     # Without standard errors nothing can be taken off.
-    xi0 = np.where(known, found.xi0, eigenvalues[..., 0])
-    valid = known & is_valid(image, noise)
+    xi0 = np.where(is_known, result.xi0, eigenvalues[..., 0])
+    valid = is_known & is_valid(image, noise)
     return {
         "xi0": xi0,
-        "xi0_errors": found.stderr,
+        "xi0_errors": result.stderr,
         **intervals,
-        "xi0_shift": found.shift,
+        "xi0_shift": result.shift,
         "eigenvalues": np.moveaxis(eigenvalues, -1, 0),
-        "eigenvalue_spread": found.spread,
+        "eigenvalue_spread": result.spread,
         "eigenvalue_spread_noise": np.sqrt(noise.others),
         "valid": valid.astype(np.uint8),
     }
@@ -203,12 +203,12 @@ def xi0_of_stokes(
     reach = method_of(image.facts["method"]).reach
     inside = ndimage.minimum_filter(np.isfinite(m0[..., 0, 0]), size=2 * reach + 1)
     m0[~inside] = np.nan
-    found = estimate_from_stokes(image, m0)
-    facts = _facts(found.xi0, found.xi0_stderr, found.valid, "two coefficients of the Stokes image")
+    result = estimate_from_stokes(image, m0)
+    facts = _facts(result.xi0, result.xi0_stderr, result.valid, "two coefficients of the Stokes image")
     text = "of the noise of pixels by distance in rows and columns"
     fitted = np.tensordot(image.analyzers, image.values.astype(float), axes=1)
     with _two_coefficients(
-        out, found, facts, header, steps=steps, overwrite=overwrite, systematic=systematic, fitted=fitted, m0=m0
+        out, result, facts, header, steps=steps, overwrite=overwrite, systematic=systematic, fitted=fitted, m0=m0
     ) as writer:
         writer.array("neighbour_correlation", image.neighbour_correlation, "", text)
     return facts
@@ -229,18 +229,18 @@ def xi0_of_partial(
     with Product(source) as product:
         product.require("mueller")
         image, systematic = MuellerImage.of(product), Systematic.of_product(product)
-    known = image.seen if image.sent is None else sent_parts(image.sent)
-    if known.sum() < 2:
+    is_determined = image.seen if image.sent is None else sent_parts(image.sent)
+    if is_determined.sum() < 2:
         raise ProcessError(f"{source} determines {image.facts['determined']}, and xi0 needs two numbers or more.")
     m0 = dominant_model(image.header, geometry_file, material_file, image.mask.shape)
     size = (-1, *image.mask.shape)
     fitted = np.where(image.mask.reshape(-1) & ~np.uint8(Mask.SATURATED), np.nan, image.fitted)
     fitted = fitted.reshape(size)
-    found = estimate(fitted, image.told_variance.reshape(size), image.w, m0)
-    facts = _facts(found.xi0, found.xi0_stderr, found.valid, f"two coefficients of {image.facts['determined']}")
+    result = estimate(fitted, image.told_variance.reshape(size), image.w, m0)
+    facts = _facts(result.xi0, result.xi0_stderr, result.valid, f"two coefficients of {image.facts['determined']}")
     steps = (*image.steps, step)
     with _two_coefficients(
-        out, found, facts, image.header, steps=steps, overwrite=overwrite, systematic=systematic, fitted=fitted, m0=m0
+        out, result, facts, image.header, steps=steps, overwrite=overwrite, systematic=systematic, fitted=fitted, m0=m0
     ):
         pass
     return facts

@@ -61,7 +61,7 @@ def _mosaics(files: Files) -> list[PublicStates]:
 def _imaging_630(files: Files) -> list[PublicStates]:
     header = "state,analyzer_deg,psg_deg,psa_deg,file"
     folders = {"mirror": "Reflexion", "smileys": "Smileys"}
-    found = []
+    states = []
     for name, folder in folders.items():
         frames = sorted((path for local, path in files.items() if f"/{folder}/" in local), key=lambda path: path.name)
         rows = []
@@ -69,8 +69,8 @@ def _imaging_630(files: Files) -> list[PublicStates]:
             *analyzer, psg, psa = (int(part) for part in path.stem.split("_"))
             angles = f"{analyzer[0] if analyzer else 0},{EXACT_DEG[psg]},{EXACT_DEG[psa]}"
             rows.append(f"{k},{angles},{path.resolve()}")
-        found.append(PublicStates(name, 630, "mirror" if name == "mirror" else "unknown", header, tuple(rows)))
-    return found
+        states.append(PublicStates(name, 630, "mirror" if name == "mirror" else "unknown", header, tuple(rows)))
+    return states
 
 
 def mirror_means(file: Path) -> PublicStates:
@@ -87,7 +87,7 @@ def mirror_means(file: Path) -> PublicStates:
 
 
 def _wollaston(files: Files) -> list[PublicStates]:
-    found = []
+    states = []
     for name, local, prefix in (("air", "cal_results.json", "Cal_"), ("plate", "sample_results.json", "")):
         data = json.loads(files[local].read_text(encoding="utf-8"))
         for key in sorted(key for key in data if key.startswith(f"{prefix}theta")):
@@ -99,8 +99,8 @@ def _wollaston(files: Files) -> list[PublicStates]:
             ]
             header = "state,psg_deg,channel_left,channel_right"
             sample = "air" if name == "air" else "unknown"
-            found.append(PublicStates(f"{name}_{nm}nm", float(nm), sample, header, tuple(rows)))
-    return found
+            states.append(PublicStates(f"{name}_{nm}nm", float(nm), sample, header, tuple(rows)))
+    return states
 
 
 def single_detector(file: Path, wavelength_nm: float, beside: int = 0) -> PublicStates:
@@ -134,12 +134,12 @@ def _charis_rows(paths: Iterable[Path]) -> list[Sequence[str]]:
         "fluxes.csv": ("wavelength_nm", "hwp_deg", "image_rotator_deg", "left", "right", "stderr"),
         "": ("wavelength_bin", "RET-ANG1", "D_IMRANG", "LCOUNTS", "RCOUNTS", "diff_std"),
     }
-    found: list[Sequence[str]] = []
+    rows: list[Sequence[str]] = []
     for path in paths:
         columns = names[path.name if path.name in names else ""]
         with path.open(encoding="utf-8") as opened:
-            found += [[row[column] for column in columns] for row in csv.DictReader(opened)]
-    return found
+            rows += [[row[column] for column in columns] for row in csv.DictReader(opened)]
+    return rows
 
 
 CONVERTERS: dict[str, Callable[[Files], list[PublicStates]]] = {

@@ -113,19 +113,19 @@ def get_files(name: str, cache: Path, progress: Progress | None = None) -> dict[
     ------
     ProcessError : there is no set of that name, or a file can neither be found nor downloaded.
     """
-    known = catalogue()
-    if name not in known:
-        raise ProcessError(f"there is no data set {name!r}; there are: {', '.join(known)}.")
-    own = os.environ.get(VARIABLE)
-    if own is not None and not Path(own).is_dir():
-        raise ProcessError(f"{VARIABLE}={own}: no such folder. It should hold a folder {name}.")
-    found = find_files(name, [SHIPPED] if own is None else [Path(own), SHIPPED])
-    if found is not None:
-        return found
-    files = known[name].all_files()
+    sets = catalogue()
+    if name not in sets:
+        raise ProcessError(f"there is no data set {name!r}; there are: {', '.join(sets)}.")
+    folder = os.environ.get(VARIABLE)
+    if folder is not None and not Path(folder).is_dir():
+        raise ProcessError(f"{VARIABLE}={folder}: no such folder. It should hold a folder {name}.")
+    present = find_files(name, [SHIPPED] if folder is None else [Path(folder), SHIPPED])
+    if present is not None:
+        return present
+    files = sets[name].all_files()
     downloaded = {}
     for number, file in enumerate(files, 1):
-        downloaded[file.local] = _downloaded(name, known[name], file, cache)
+        downloaded[file.local] = _downloaded(name, sets[name], file, cache)
         if progress:
             progress(number, len(files))
     return downloaded
@@ -133,24 +133,24 @@ def get_files(name: str, cache: Path, progress: Progress | None = None) -> dict[
 
 def find_files(name: str, roots: Sequence[Path]) -> dict[str, Path] | None:
     """The files of a set (or its reduced form) in the folder `name` of one of `roots`; None if not all are there."""
-    known = catalogue()[name]
+    public_set = catalogue()[name]
     for root in roots:
-        for form in filter(None, (known.all_files(), known.reduced)):
-            if (found := _found(root / name, form)) is not None:
-                return found
+        for form in filter(None, (public_set.all_files(), public_set.reduced)):
+            if (files := _found(root / name, form)) is not None:
+                return files
     return None
 
 
 def _found(folder: Path, files: Sequence[SetFile]) -> dict[str, Path] | None:
     """The files where all are there with the right content."""
-    found = {}
+    paths = {}
     for file in files:
         places = (folder / file.local, folder / file.path)
         path = next((p for p in places if p.is_file() and _sha256(p) == file.sha256), None)
         if path is None:
             return None
-        found[file.local] = path
-    return found
+        paths[file.local] = path
+    return paths
 
 
 def _sha256(path: Path) -> str:

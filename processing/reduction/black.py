@@ -56,12 +56,12 @@ class Black:
             return None
         exposure = capture.column("exposure_s")[dark].astype(float)
         repeats = np.maximum(capture.column("repeats")[dark].astype(float), 1)
-        means, found = [], []
+        means, groups = [], []
         for group in _groups(exposure):
             mean, scatter, stderr = _mean_of(capture, dark[group])
             means.append(mean)
-            found.append([exposure[group].mean(), len(group), repeats[group].sum(), scatter, stderr])
-        exposure_s, states, frames, scatter, stderr = np.array(found, dtype=float).T
+            groups.append([exposure[group].mean(), len(group), repeats[group].sum(), scatter, stderr])
+        exposure_s, states, frames, scatter, stderr = np.array(groups, dtype=float).T
         return cls(np.stack(means), exposure_s, states, frames, scatter, stderr)
 
     @property
@@ -84,12 +84,12 @@ class Black:
             return np.ones((len(exposure), 1))
         number = self.frames / self.frames.sum()
         out = np.broadcast_to(number, (len(exposure), len(number))).copy()
-        known = ~np.isnan(exposure)
+        is_known = ~np.isnan(exposure)
         line = np.stack([np.ones_like(self.exposure_s), self.exposure_s], axis=1)
         fit = np.linalg.solve((line.T * number) @ line, line.T * number)
-        out[known] = np.stack([np.ones(known.sum()), exposure[known]], axis=1) @ fit
+        out[is_known] = np.stack([np.ones(is_known.sum()), exposure[is_known]], axis=1) @ fit
         near = np.abs(exposure[:, None] - self.exposure_s)
-        exact = known & self.matches(exposure)
+        exact = is_known & self.matches(exposure)
         out[exact] = np.eye(len(number))[np.argmin(near[exact], axis=1)]
         return out
 
@@ -130,29 +130,29 @@ class Black:
         total = f"{self.frames.sum():g} dark frame(s)"
         if len(self.exposure_s) == 1:
             return f"mean of {total}"
-        own = f"mean of the dark frames of each exposure ({_each(self.exposure_s, self.frames)})"
+        matched_text = f"mean of the dark frames of each exposure ({_each(self.exposure_s, self.frames)})"
         if matched.all():
-            return own
+            return matched_text
         line = f"offset + dark current x exposure, fitted to {total} at {_seconds(self.exposure_s)}"
         if not matched.any():
             return line
-        return f"{own}; at {_seconds(light[~matched])}: {line}"
+        return f"{matched_text}; at {_seconds(light[~matched])}: {line}"
 
     def warnings(self, exposure_s: ArrayLike) -> list[str]:
         """What the user should know about exposures (N,) without darks of their own."""
         light = np.unique(np.asarray(exposure_s, dtype=float))
-        other = light[~self.matches(light)]
-        if not self.measured or other.size == 0:
+        unmatched = light[~self.matches(light)]
+        if not self.measured or unmatched.size == 0:
             return []
         if len(self.exposure_s) == 1:
             dark_s = float(self.exposure_s[0])
             return [
                 f"the dark states were exposed {dark_s:g} s, other states differ from that by up to "
-                f"{np.max(np.abs(other - dark_s)):g} s: their dark current is not taken out. "
+                f"{np.max(np.abs(unmatched - dark_s)):g} s: their dark current is not taken out. "
                 "Take darks at the exposures of the sample."
             ]
         low, high = float(self.exposure_s[0]), float(self.exposure_s[-1])
-        beyond = other[(other < low * (1 - SAME_EXPOSURE)) | (other > high * (1 + SAME_EXPOSURE))]
+        beyond = unmatched[(unmatched < low * (1 - SAME_EXPOSURE)) | (unmatched > high * (1 + SAME_EXPOSURE))]
         current = float(np.abs(self.means[-1].mean() - self.means[0].mean()) / (high - low))
         reach = max(low - beyond.min(initial=low), beyond.max(initial=high) - high)
         if current * reach < UNSEEN_COUNTS:
@@ -186,9 +186,9 @@ def _mean_of(capture: Capture, states: NDArray[np.int64]) -> tuple[NDArray[np.fl
         # In blocks of rows: the whole image in floating numbers would be the largest thing in memory.
         sums = np.zeros(3)
         for rows in capture.row_blocks():
-            left = (capture.frames(int(k), rows) - mean[:, rows]).ravel()
-            left = left[np.isfinite(left)]
-            sums += [left.size, left.sum(), left @ left]
+            residual = (capture.frames(int(k), rows) - mean[:, rows]).ravel()
+            residual = residual[np.isfinite(residual)]
+            sums += [residual.size, residual.sum(), residual @ residual]
         # A black level that moves as a whole is not noise of the pixels.
         each.append((sums[2] - sums[1] ** 2 / sums[0]) / sums[0] if sums[0] else float("nan"))
     scatter = float(np.mean(each)) * n / (n - 1)

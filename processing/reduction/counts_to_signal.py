@@ -58,9 +58,9 @@ class CountCorrection:
         ------
         CaptureError : another capture does not fit, is simulated where this one is measured, or lacks such states.
         """
-        for other, name in ((dark_from, "dark"), *((c, "flat") for c in flat_from)):
-            if other is not None:
-                _check_partner(capture, other, name)
+        for partner, name in ((dark_from, "dark"), *((c, "flat") for c in flat_from)):
+            if partner is not None:
+                _check_partner(capture, partner, name)
         if bad is not None and bad.shape != capture.stored_shape:
             raise CaptureError(
                 f"the bad-pixel map is {bad.shape}, the frames of {capture.path} are {capture.stored_shape}."

@@ -71,21 +71,21 @@ def capture_changes(capture: Capture, model: InstrumentModel, states: NDArray[np
         return None
     # An effect counts the states of the sample as `diagnose` saw them, also where some of them are left out here.
     of_sample = states_of_sample(capture)
-    seen = of_sample if np.isin(states, of_sample).all() else states
-    angles = {name: value[seen] for name, value in capture.angles_deg.items()}
+    of_diagnosis = of_sample if np.isin(states, of_sample).all() else states
+    angles = {name: value[of_diagnosis] for name, value in capture.angles_deg.items()}
     channels = tuple(c.name for c in model.channels)
-    when = elapsed(capture.column("host_time_s")[seen], len(seen))
-    top, run = full_scale(capture, seen), capture.run_of_states[seen]
-    conditions = Conditions(angles, len(seen), channels, when, top, run)
-    return changes_of(model, conditions, capture.name).of_states(np.searchsorted(seen, states))
+    when = elapsed(capture.column("host_time_s")[of_diagnosis], len(of_diagnosis))
+    top, run = full_scale(capture, of_diagnosis), capture.run_of_states[of_diagnosis]
+    conditions = Conditions(angles, len(of_diagnosis), channels, when, top, run)
+    return changes_of(model, conditions, capture.name).of_states(np.searchsorted(of_diagnosis, states))
 
 
 def references(capture: Capture, model: InstrumentModel) -> dict[str, str]:
     """Fact `reference` of a product: at which moment it holds, where effects of the capture depend on time."""
-    own = [e for e in model.effects if e.scope == "instrument" or capture.name in e.captures]
-    moments = {e.kind: instrument_effects()[e.kind].reference for e in own if e.kind != KIND}
-    told = [f"{moment} ({kind})" for kind, moment in moments.items() if moment is not None]
-    return {"reference": "; ".join(told)} if told else {}
+    effects = [e for e in model.effects if e.scope == "instrument" or capture.name in e.captures]
+    moments = {e.kind: instrument_effects()[e.kind].reference for e in effects if e.kind != KIND}
+    texts = [f"{moment} ({kind})" for kind, moment in moments.items() if moment is not None]
+    return {"reference": "; ".join(texts)} if texts else {}
 
 
 def extra_retardance(changes: Changes, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -99,11 +99,11 @@ def extra_retardance(changes: Changes, x: NDArray[np.float64], y: NDArray[np.flo
 
 def with_extra(changes: Changes, extra: NDArray[np.float64]) -> Changes:
     """The changes at a place with these extra retardances (elements,)."""
-    here = defaultdict(lambda: np.zeros(()), changes.retardance_rad)
+    retardance = defaultdict(lambda: np.zeros(()), changes.retardance_rad)
     for element, value in zip(changes.field_retardance_rad, extra, strict=True):
-        here[element] = here[element] + float(value)
+        retardance[element] = retardance[element] + float(value)
     out = copy(changes)
-    out.retardance_rad = here
+    out.retardance_rad = retardance
     return out
 
 

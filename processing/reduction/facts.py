@@ -92,8 +92,8 @@ def mueller_facts(
 
 def determined_words(inversion: Inversion) -> str:
     """Which elements a partial polarimeter determines, as `seen_elements` reads it."""
-    seen = determined_elements(inversion.basis)
-    return ", ".join(f"m{k // 4}{k % 4}" for k in np.flatnonzero(seen)) or "combinations only"
+    is_determined = determined_elements(inversion.basis)
+    return ", ".join(f"m{k // 4}{k % 4}" for k in np.flatnonzero(is_determined)) or "combinations only"
 
 
 def _median(values: NDArray[Any]) -> float:

@@ -60,14 +60,14 @@ class FlatField:
         lost = np.zeros(captures[0].frame_shape, bool)
         used = frames = 0
         for capture in captures:
-            own = Black.of(capture) or black or Black.level(capture.header.detector.black_level_counts)
+            black_of = Black.of(capture) or black or Black.level(capture.header.detector.black_level_counts)
             exposure, repeats = capture.column("exposure_s").astype(float), capture.column("repeats")
             for k in capture.states_with("flat"):
                 frame = capture.frames(int(k))
                 clipped = np.zeros(lost.shape, bool) if saturation is None else (frame >= saturation).any(axis=0)
                 # In a bracket the long exposures saturate; the others hold the same response.
                 if clipped.mean() <= FEW:
-                    total += frame - own.at(exposure[k])
+                    total += frame - black_of.at(exposure[k])
                     lost |= clipped
                     used += 1
                     frames += int(repeats[k])
@@ -120,7 +120,7 @@ class FlatCapture:
 
 def flat_captures(folder: Path) -> list[FlatCapture]:
     """All captures of the flat field under a folder."""
-    found = []
+    flats = []
     for path in sorted(folder.rglob("*.h5")):
         try:
             with Capture(path) as capture:
@@ -128,8 +128,8 @@ def flat_captures(folder: Path) -> list[FlatCapture]:
         except CaptureError:
             continue
         if flat is not None:
-            found.append(flat)
-    return found
+            flats.append(flat)
+    return flats
 
 
 def nearest_flat(flats: Sequence[FlatCapture], capture: Capture) -> Path | None:

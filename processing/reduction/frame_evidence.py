@@ -114,26 +114,26 @@ class FrameEvidence:
         number, camera_ns : of the frame, as the camera reports them; 0 where it has no clock.
         light : whether it is a light state.
         """
-        found = []
+        findings = []
         before, last_number, last_ns = self._last
         if number and number == last_number:
             text = (
                 f"state {state} has the frame number {number} of state {before}: the camera does not count its frames"
             )
-            found.append(FrameFinding(state, "number", text))
+            findings.append(FrameFinding(state, "number", text))
         if camera_ns and last_ns and camera_ns <= last_ns:
             text = (
                 f"state {state}: the camera's clock stands or runs back, its time is not after that of state {before}"
             )
-            found.append(FrameFinding(state, "time", text))
+            findings.append(FrameFinding(state, "time", text))
         self._last = state, number, camera_ns
         if light and self._rows is not None:
             means = block_means(pixels, BLOCKS, BLOCKS)
             self._blocks[state] = (means - self._black) / exposure_s
         # A clock that stands does so in every state from then on.
-        found = [finding for finding in found if finding.kind not in {earlier.kind for earlier in self.found}]
-        self.found += found
-        return found
+        findings = [finding for finding in findings if finding.kind not in {earlier.kind for earlier in self.found}]
+        self.found += findings
+        return findings
 
     def forget(self) -> None:
         """The states taken so far are taken again."""
@@ -148,10 +148,10 @@ class FrameEvidence:
         if not len(states) or not np.isfinite(rows).all():
             return []
         blocks = np.array([self._blocks[state] for state in states])
-        found = mirrored_pictures(states, rows, blocks)
-        found = found or brightness_steps(states, rows, blocks.mean(axis=(1, 2)))
-        self.found += found
-        return found
+        findings = mirrored_pictures(states, rows, blocks)
+        findings = findings or brightness_steps(states, rows, blocks.mean(axis=(1, 2)))
+        self.found += findings
+        return findings
 
 
 def brightness_steps(states: NDArray[np.int64], rows: Array, light: Array) -> list[FrameFinding]:
@@ -163,21 +163,21 @@ def brightness_steps(states: NDArray[np.int64], rows: Array, light: Array) -> li
     rows : (N, 16) of the measurement matrix.
     light : (N,) mean light of the frames.
     """
-    found: list[FrameFinding] = []
+    findings: list[FrameFinding] = []
     keep = np.ones(len(states), dtype=bool)
     light = np.array(light, dtype=float)
-    while len(found) < MOST_FOUND:
+    while len(findings) < MOST_FOUND:
         n, spare, outside = _outside(rows[keep])
         if spare < SPARE:
             break
         index, y = np.flatnonzero(keep), light[keep]
-        left = outside @ y
-        rss = float(left @ left)
+        residual = outside @ y
+        rss = float(residual @ residual)
         # One state by itself: what it is over what the others say.
         free = np.clip(np.diag(outside), 1e-9, None)
-        alone = np.where(free > 0.1, left**2 / free, 0.0)
+        alone = np.where(free > 0.1, residual**2 / free, 0.0)
         k = int(np.argmax(alone))
-        expected = y[k] - left[k] / free[k]
+        expected = y[k] - residual[k] / free[k]
         best = (rss - float(alone[k]), k, False, y[k] / expected if expected > 0 else np.inf)
         # From one on: what comes before is known but for what comes after, times a factor.
         for s in range(2, n - 1):
@@ -195,7 +195,7 @@ def brightness_steps(states: NDArray[np.int64], rows: Array, light: Array) -> li
             break
         state = int(states[index[k]])
         where = f"from state {state} on" if onwards else f"state {state} alone"
-        found.append(
+        findings.append(
             FrameFinding(
                 state,
                 "brightness",
@@ -207,7 +207,7 @@ def brightness_steps(states: NDArray[np.int64], rows: Array, light: Array) -> li
             light[index[k:]] /= factor
         else:
             keep[index[k]] = False
-    return found
+    return findings
 
 
 def _outside(rows: Array) -> tuple[int, int, Array]:
@@ -220,9 +220,9 @@ def _outside(rows: Array) -> tuple[int, int, Array]:
 def _drifts(outside: Array, y: Array, step: float) -> bool:
     """Whether light that drifts evenly explains as much as a step."""
     ramp = outside @ (y * np.linspace(-1, 1, len(y)))
-    left = outside @ y
+    residual = outside @ y
     norm = float(ramp @ ramp)
-    return norm > 0 and float(left @ left) - float(left @ ramp) ** 2 / norm <= 2 * step
+    return norm > 0 and float(residual @ residual) - float(residual @ ramp) ** 2 / norm <= 2 * step
 
 
 def mirrored_pictures(states: NDArray[np.int64], rows: Array, blocks: Array) -> list[FrameFinding]:
@@ -240,15 +240,15 @@ def mirrored_pictures(states: NDArray[np.int64], rows: Array, blocks: Array) -> 
     if (step := _mirrored_from(outside, blocks)) is not None:
         k, words = step
         return [_mirrored(int(states[k]), f"from state {states[k]} on", words)]
-    found: list[FrameFinding] = []
+    findings: list[FrameFinding] = []
     blocks = blocks.copy()
-    while len(found) < MOST_FOUND and (one := _mirrored_alone(rows, blocks)) is not None:
-        k, words = one
-        if int(states[k]) in (finding.state for finding in found):
+    while len(findings) < MOST_FOUND and (candidate := _mirrored_alone(rows, blocks)) is not None:
+        k, words = candidate
+        if int(states[k]) in (finding.state for finding in findings):
             break
         blocks[k] = MIRRORS[words](blocks[k])
-        found.append(_mirrored(int(states[k]), f"state {states[k]} alone", words))
-    return found
+        findings.append(_mirrored(int(states[k]), f"state {states[k]} alone", words))
+    return findings
 
 
 def _mirrored(state: int, where: str, words: str) -> FrameFinding:
@@ -261,18 +261,18 @@ def _mirrored_from(outside: Array, blocks: Array) -> tuple[int, str] | None:
     """From which state on mirroring lets all agree with those before, and how; None if from no state on."""
     n = len(blocks)
     flat = blocks.reshape(n, -1)
-    left = outside @ flat
-    rss, power = float(np.square(left).sum()), float(np.square(flat).sum())
+    residual = outside @ flat
+    rss, power = float(np.square(residual).sum()), float(np.square(flat).sum())
     best: tuple[float, int, str] = (MIRRORED_LEAVES * rss, 0, "")
     for words, mirror in MIRRORS.items():
         change = mirror(blocks).reshape(n, -1) - flat
-        onwards = left.copy()
+        onwards = residual.copy()
         for k in range(n - 1, 0, -1):
             onwards += np.outer(outside[:, k], change[k])
             if k < n - 1:
                 best = min(best, (float(np.square(onwards).sum()), k, words))
-    seen = rss > LEAST_PATTERN**2 * power * np.trace(outside) / n**2
-    return best[1:] if best[2] and seen else None
+    is_visible = rss > LEAST_PATTERN**2 * power * np.trace(outside) / n**2
+    return best[1:] if best[2] and is_visible else None
 
 
 def _mirrored_alone(rows: Array, blocks: Array) -> tuple[int, str] | None:
@@ -292,20 +292,20 @@ def _mirrored_alone(rows: Array, blocks: Array) -> tuple[int, str] | None:
     ones = idctn(np.ones(blocks.shape[1:]), norm="ortho")
     odd = {words: (dctn(way(ones), norm="ortho") < 0).ravel() for words, way in MIRRORS.items()}
     for k in range(n):
-        others = np.arange(n) != k
-        inverse = np.linalg.pinv(rows[others], rcond=1e-8)
+        mask_others = np.arange(n) != k
+        inverse = np.linalg.pinv(rows[mask_others], rcond=1e-8)
         weights = rows[k] @ inverse
-        unknowns = round(float(np.trace(rows[others] @ inverse)))
+        unknowns = round(float(np.trace(rows[mask_others] @ inverse)))
         freedom = n - 1 - unknowns
         if freedom < SPARE - 1:
             continue
-        fitted = rows[others] @ (inverse @ cosines[others])
-        residual = cosines[others] - fitted
+        fitted = rows[mask_others] @ (inverse @ cosines[mask_others])
+        residual = cosines[mask_others] - fitted
         power = np.square(fitted).mean(axis=0)
         noise = np.square(residual).sum(axis=0) / freedom
         noise_share = noise * unknowns / (n - 1) / np.maximum(power, np.finfo(float).tiny)
         share = np.where(noise_share < NOISE_SHARE, 1 - noise_share, 0.0)
-        predicted = weights @ cosines[others]
+        predicted = weights @ cosines[mask_others]
         for mask in odd.values():
             pattern = np.where(mask, share * predicted, 0.0)
             common, lent = _common_variance(noise[mask], freedom)
@@ -342,12 +342,12 @@ def _common_variance(variances: Array, freedom: int) -> tuple[float, float]:
 
 def evidence_of(capture: Capture) -> tuple[str, ...]:
     """What speaks against the frames of a capture, in words: what its runs reported, and what its columns say."""
-    told = capture.closing.get("evidence")
-    reported = [entry for entry in told if isinstance(entry, dict)] if isinstance(told, list) else []
+    record = capture.closing.get("evidence")
+    reported = [entry for entry in record if isinstance(entry, dict)] if isinstance(record, list) else []
     texts = [str(entry.get("text", "")) for entry in reported]
     kinds = {(entry.get("kind"), entry.get("state")) for entry in reported}
-    found = [*_identical(capture), *_numbers_again(capture), *_steps(capture)]
-    return tuple(dict.fromkeys([*texts, *(f.text for f in found if (f.kind, f.state) not in kinds)]))
+    findings = [*_identical(capture), *_numbers_again(capture), *_steps(capture)]
+    return tuple(dict.fromkeys([*texts, *(f.text for f in findings if (f.kind, f.state) not in kinds)]))
 
 
 def _identical(capture: Capture) -> list[FrameFinding]:
@@ -372,26 +372,26 @@ def _identical(capture: Capture) -> list[FrameFinding]:
 
 def _numbers_again(capture: Capture) -> list[FrameFinding]:
     """Frame numbers and times of the camera's clock that two states of one run share."""
-    found: list[FrameFinding] = []
+    findings: list[FrameFinding] = []
     columns: tuple[tuple[Kind, str, str], ...] = (
         ("number", "frame_id", "frame number"),
         ("time", "camera_time_ns", "time of the camera's clock"),
     )
-    for kind, name, what in columns:
+    for kind, name, quantity in columns:
         values = capture.column(name)
         for run in np.unique(capture.run_of_states):
             mine = np.flatnonzero((capture.run_of_states == run) & (values != 0))
             again = mine[1:][values[mine[1:]] == values[mine[:-1]]]
             if again.size:
                 state = int(capture.done[again[0]])
-                text = f"{again.size} states have the {what} of the state before, the first of them state {state}"
-                found.append(FrameFinding(state, kind, text))
-    return found
+                text = f"{again.size} states have the {quantity} of the state before, the first of them state {state}"
+                findings.append(FrameFinding(state, kind, text))
+    return findings
 
 
 def _steps(capture: Capture) -> list[FrameFinding]:
     """Steps of the brightness in each run, by the mean of each frame that `acquire` noted."""
-    model, found = capture.instrument, []
+    model, findings = capture.instrument, []
     if model is None or not model.axes:
         return []
     for run in np.unique(capture.run_of_states):
@@ -404,5 +404,5 @@ def _steps(capture: Capture) -> list[FrameFinding]:
         if not all(np.isfinite(column).all() for column in angles.values()):
             continue
         rows = model.model_copy(update={"effects": ()}).rows(angles).mean(axis=1)
-        found += brightness_steps(capture.done[chosen], rows, monitor)
-    return found
+        findings += brightness_steps(capture.done[chosen], rows, monitor)
+    return findings

@@ -25,9 +25,9 @@ def choose_model(capture: Capture, instrument: Path | None) -> InstrumentModel:
 def require_belongs(capture: Capture, model: InstrumentModel) -> None:
     """Raise CaptureError where the capture's frames or axes are not those of the instrument."""
     mosaics = {True: "a polarization mosaic", False: "no polarization mosaic"}
-    has, wanted = capture.header.mosaic is not None, model.mosaic is not None
-    if has != wanted:
-        difference = f"its camera has {mosaics[has]}, that of the instrument {model.name!r} {mosaics[wanted]}"
+    has, needs = capture.header.mosaic is not None, model.mosaic is not None
+    if has != needs:
+        difference = f"its camera has {mosaics[has]}, that of the instrument {model.name!r} {mosaics[needs]}"
     elif not has and capture.channels != len(model.channels):
         difference = (
             f"its frames have {_counted(capture.channels)}, the instrument {model.name!r} has {len(model.channels)}"

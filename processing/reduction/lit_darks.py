@@ -79,13 +79,13 @@ class LitDarks:
 
     def without_light(self, exposure_s: float) -> str | None:
         """Tell once that enough light states of an exposure were taken and their mean is no brighter than a dark."""
-        seen = self._seen.get(exposure_s, 0)
-        if seen < self._needed or exposure_s in self._judged:
+        count = self._seen.get(exposure_s, 0)
+        if count < self._needed or exposure_s in self._judged:
             return None
         self._judged.add(exposure_s)
         total, noise = self._total[exposure_s]
         dark = next(dark for key, dark in self._darks.items() if key[0] == exposure_s)
-        if _top(total / seen - dark[0]) > NOISE_ALLOWANCE * float(np.hypot(dark[1], noise)):
+        if _top(total / count - dark[0]) > NOISE_ALLOWANCE * float(np.hypot(dark[1], noise)):
             return None
         return f"the light states of {exposure_s:g} s are no brighter than the dark ones"
 

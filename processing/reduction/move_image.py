@@ -28,9 +28,9 @@ def shifted_back(image: NDArray[np.floating], x_px: float, y_px: float, blur_px2
 def taps(shift_px: float) -> NDArray[np.float64]:
     """Weights of neighbours along one axis, an odd number of them, that move an image back by so many pixels."""
     reach = REACH + math.ceil(abs(shift_px))
-    one = np.zeros(2 * (reach + REACH) + 1)
-    one[reach + REACH] = 1.0
-    weights = ndimage.shift(one, shift_px, order=5, mode="mirror")[REACH:-REACH]
+    impulse = np.zeros(2 * (reach + REACH) + 1)
+    impulse[reach + REACH] = 1.0
+    weights = ndimage.shift(impulse, shift_px, order=5, mode="mirror")[REACH:-REACH]
     return np.asarray(weights / weights.sum())
 
 

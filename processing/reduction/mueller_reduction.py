@@ -157,8 +157,8 @@ class MuellerReduction:
         reader = BlockReader(capture, states, correction, counts, struck=struck)
         source = LeveledSource.of(reader, model, basis, varies)
         w, levels = source.leveled(measurement_matrix(capture, model, states, changes))
-        what = "".join(f"{text}: " for text in (capture.path, *warnings))
-        inversion = Inversion.of(w.reshape(-1, ELEMENTS), what, basis, levels.spent if levels else 0.0)
+        source_text = "".join(f"{text}: " for text in (capture.path, *warnings))
+        inversion = Inversion.of(w.reshape(-1, ELEMENTS), source_text, basis, levels.spent if levels else 0.0)
         if inversion.rank < ELEMENTS and (choice.physical or varies):
             raise ProcessError(
                 f"{capture.path}: instrument {model.name!r} determines {inversion.rank} of 16 numbers; --physical and "
@@ -206,31 +206,31 @@ class MuellerReduction:
 
     def block(self, solver: Solver, rows: slice) -> dict[str, NDArray[Any]]:
         """The planes of some rows, each (..., rows, columns)."""
-        found = self._solved(solver, solver.reader.read(rows))
+        planes_found = self._solved(solver, solver.reader.read(rows))
         planes = self.planes
         shape = (rows.stop - rows.start, solver.reader.capture.frame_shape[1])
-        if "mueller_physical" in planes and "mueller_physical" not in found:
-            found["mueller_physical"] = nearest(found["mueller"])
-        return {name: found[name].reshape(*plane.leading, *shape) for name, plane in planes.items()}
+        if "mueller_physical" in planes and "mueller_physical" not in planes_found:
+            planes_found["mueller_physical"] = nearest(planes_found["mueller"])
+        return {name: planes_found[name].reshape(*plane.leading, *shape) for name, plane in planes.items()}
 
     def _solved(self, solver: Solver, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        found = self._estimated(solver, frames)
-        lost = (found["pixel_flags"] & LOST) != 0
+        planes = self._estimated(solver, frames)
+        lost = (planes["pixel_flags"] & LOST) != 0
         if self.sent is not None:
-            found |= self.sent.planes(found["mueller"], found["residual_rms"], solver)
+            planes |= self.sent.planes(planes["mueller"], planes["residual_rms"], solver)
             if self.systematic is not None:
-                found["stokes_systematic"] = self.systematic.errors(found["mueller"], self.sent.rows)
-                found["stokes_systematic"][~self.sent.seen] = np.nan
+                planes["stokes_systematic"] = self.systematic.errors(planes["mueller"], self.sent.rows)
+                planes["stokes_systematic"][~self.sent.seen] = np.nan
         elif self.systematic is not None:
-            found["mueller_systematic"] = self.systematic.errors(found["mueller"])
-        _blank(found, lost, ~determined_elements(self.inversion.basis))
-        return found
+            planes["mueller_systematic"] = self.systematic.errors(planes["mueller"])
+        _blank(planes, lost, ~determined_elements(self.inversion.basis))
+        return planes
 
     def _estimated(self, solver: Solver, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        found = solver.solve(frames)
+        planes = solver.solve(frames)
         if self.levels is not None:
-            self.levels.add_errors(found, self.inversion)
-        return found
+            self.levels.add_errors(planes, self.inversion)
+        return planes
 
     def region(self, capture: Capture, rows: slice, columns: slice) -> tuple[MuellerImage, Array]:
         """A region as an image of one pixel, the mean of those that can be used, and its intensities (N channels,).
@@ -243,7 +243,7 @@ class MuellerReduction:
         """
         solver = self.solver(capture)
         frames = solver.reader.read(rows)
-        found = self._estimated(solver, frames)
+        planes = self._estimated(solver, frames)
         signal = np.empty(frames.shape, np.float32)
         solver.reader.signal(frames, slice(None), signal)
         shape = (rows.stop - rows.start, capture.frame_shape[1])
@@ -251,12 +251,12 @@ class MuellerReduction:
         def part(values: NDArray[Any]) -> NDArray[Any]:
             return values.reshape(*values.shape[:-1], *shape)[..., columns]
 
-        flags = part(found["pixel_flags"])
+        flags = part(planes["pixel_flags"])
         good = flags & LOST == 0
         count = int(good.sum())
         if not count:
             raise ProcessError(f"no pixel can be used ({Mask.words(int(flags.max()))})")
-        mueller, errors = part(found["mueller"])[..., good], part(found["mueller_errors"])[..., good]
+        mueller, errors = part(planes["mueller"])[..., good], part(planes["mueller_errors"])[..., good]
         w = self._matrix_at(rows, columns, capture.frame_shape)
         intensities = part(signal.reshape(len(w), -1))[:, good].mean(axis=1, dtype=float)
         m = mueller.reshape(ELEMENTS, -1).mean(axis=1, dtype=float)

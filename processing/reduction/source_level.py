@@ -120,8 +120,8 @@ class SourceMoments:
 
     def levels(self, w: Array, basis: Array) -> SourceLevels | None:
         """Levels for W (L, 16) of which `basis` (16, R) is determined; None where nothing is left over for them."""
-        seen = w @ basis
-        rows, unknowns = seen.shape
+        determined = w @ basis
+        rows, unknowns = determined.shape
         states = rows // self.channels
         state = np.repeat(np.arange(states), self.channels)
         free = self.pixels * (rows - unknowns)
@@ -130,14 +130,14 @@ class SourceMoments:
         level, fitted, spread, covariance = np.ones(states), 0.0, 0.0, np.zeros((states, states))
         rounding = float(np.finfo(float).eps * np.trace(self.products))
         for _ in range(STEPS):
-            a = level[state, None] * seen
+            a = level[state, None] * determined
             back = np.linalg.pinv(a)
             outside = np.eye(rows) - a @ back
-            left = outside @ self.products
+            residual = outside @ self.products
             # Data without noise leave only the rounding of these sums, which may be below zero.
-            unit = max(float(np.trace(left)), rounding) / (free - fitted)
-            curvature = _by_state(outside * (seen @ (back @ self.products @ back.T) @ seen.T), states)
-            gradient = -np.diag(left @ back.T @ seen.T).reshape(states, -1).sum(axis=1)
+            unit = max(float(np.trace(residual)), rounding) / (free - fitted)
+            curvature = _by_state(outside * (determined @ (back @ self.products @ back.T) @ determined.T), states)
+            gradient = -np.diag(residual @ back.T @ determined.T).reshape(states, -1).sum(axis=1)
             size, vector = np.linalg.eigh(curvature)
             vector, size = vector[:, size > UNSEEN * size[-1]], size[size > UNSEEN * size[-1]]
             # A common factor of all levels is M's: what is left of it in the numbers goes to the mean.
@@ -150,7 +150,7 @@ class SourceMoments:
             moved, level = float(np.abs(new - level).max()), new
             if moved < SETTLED:
                 break
-        a = level[state, None] * seen
+        a = level[state, None] * determined
         back = np.linalg.pinv(a)
         # Directions of the levels that turn M, without those that a pixel's own noise hides.
         size, vector = np.linalg.eigh(covariance)

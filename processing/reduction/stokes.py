@@ -140,19 +140,19 @@ def reduce_stokes(
     if response is not None:
         frame = corrected_frame(frame, response, layout, analyzers)
     channels = demosaic(frame, layout, method)
-    found = stokes(channels, analyzers, layout, method, merged=merged, frame=frame)
+    maps = stokes(channels, analyzers, layout, method, merged=merged, frame=frame)
     planes = PLANES
     if systematic is not None:
         planes = PLANES | SYSTEMATIC
-        found |= systematic_errors(systematic, found)
-    found["pixel_flags"] = _spread(merged.mask, channels.shape[1:])
-    lost = (found["pixel_flags"] & ~np.uint8(Mask.SATURATED)) != 0
-    dark = ~(found["s0"] > 0)
-    for name, values in found.items():
+        maps |= systematic_errors(systematic, maps)
+    maps["pixel_flags"] = _spread(merged.mask, channels.shape[1:])
+    lost = (maps["pixel_flags"] & ~np.uint8(Mask.SATURATED)) != 0
+    dark = ~(maps["s0"] > 0)
+    for name, values in maps.items():
         if name != "pixel_flags":
             values[..., lost | dark if name in RATIOS else lost] = np.nan
     rows, columns = channels.shape[1:]
-    facts = _facts(found, analyzers, noise, correction, method=method, states=len(states))
+    facts = _facts(maps, analyzers, noise, correction, method=method, states=len(states))
     facts["warnings"] += cut_off
     facts |= references(capture, model) | exposure_fact(capture, states)
     with ProductWriter(
@@ -165,7 +165,7 @@ def reduce_stokes(
             product.array(name, neighbour_correlation(layout, method, solve, parts), "", text)
         product.array("analyzers", analyzers, "", "rows (channel, 3): intensity = row . (S0, S1, S2)")
         facts |= systematic.store(product) if systematic is not None else {}
-        product.write(slice(0, rows), **found)
+        product.write(slice(0, rows), **maps)
         product.seal(facts)
     return facts
 
@@ -200,10 +200,10 @@ def stokes(
         if merged.relative is not None:
             variance += _by_channel(merged.relative, layout, channels) * light**2
     covariance = stokes_covariance(variance, layout, method, solve, frame=frame)
-    found = {"s0": s0, "s1": s1, "s2": s2, "closure": closure, "stokes_covariance": covariance}
-    found |= {f"s{k}_errors": np.sqrt(covariance[k]) for k in range(LINEAR)}
-    found |= linear_polarization(s0, s1, s2, covariance)
-    return {name: np.asarray(values, dtype=np.float32) for name, values in found.items()}
+    maps = {"s0": s0, "s1": s1, "s2": s2, "closure": closure, "stokes_covariance": covariance}
+    maps |= {f"s{k}_errors": np.sqrt(covariance[k]) for k in range(LINEAR)}
+    maps |= linear_polarization(s0, s1, s2, covariance)
+    return {name: np.asarray(values, dtype=np.float32) for name, values in maps.items()}
 
 
 def linear_polarization(
@@ -222,19 +222,19 @@ def linear_polarization(
         along = u * u * c11 + v * v * c22 + 2 * u * v * c12
         cross = u * c01 + v * c02
         dolp_variance = (along - 2 * dolp * cross + dolp**2 * c00) / s0**2
-        own = ((c11 + c22) / s0**2, (c11**2 + c22**2 + 2 * c12**2) / s0**4)
-        degree = interval(dolp, np.maximum(dolp_variance, 0.0), *own)
+        moments = ((c11 + c22) / s0**2, (c11**2 + c22**2 + 2 * c12**2) / s0**4)
+        degree = interval(dolp, np.maximum(dolp_variance, 0.0), *moments)
         half, low, high = (np.rad2deg(part) / 2 for part in directions(np.stack([s1, s2]), np.stack([c11, c22, c12])))
     angle = np.rad2deg(aolp)
-    found = {"dolp": degree.value, "dolp_errors": degree.error, "dolp_95": np.stack([degree.low, degree.high])}
-    found |= {"aolp_deg": angle, "aolp_deg_errors": half}
-    return found | {"aolp_deg_95": np.stack([angle + low, angle + high])}
+    maps = {"dolp": degree.value, "dolp_errors": degree.error, "dolp_95": np.stack([degree.low, degree.high])}
+    maps |= {"aolp_deg": angle, "aolp_deg_errors": half}
+    return maps | {"aolp_deg_95": np.stack([angle + low, angle + high])}
 
 
 def _systematic(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> Systematic | None:
     def rows(other: InstrumentModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        whole, analyzers = channel_rows(capture, other, states, capture_changes(capture, other, states))
-        return whole[None], analyzers[None]
+        w, analyzers = channel_rows(capture, other, states, capture_changes(capture, other, states))
+        return w[None], analyzers[None]
 
     def counts(other: InstrumentModel) -> CountsCorrection | None:
         return counts_correction(capture_changes(capture, other, states), other)
@@ -333,5 +333,5 @@ def condition_number_linear(analyzers: NDArray[np.float64]) -> float:
 
 
 def _median(values: NDArray[Any]) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else float("nan")
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else float("nan")

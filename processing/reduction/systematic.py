@@ -82,8 +82,8 @@ class Systematic:
             for effects in error.directions:
                 label = ", ".join(dict.fromkeys(" ".join(filter(None, (e.kind, e.element))) for e in effects))
                 bent = counts(model.model_copy(update={"effects": effects}))
-                other = model.model_copy(update={"effects": (*model.effects, *effects)})
-                moved.append((label, np.nan, other, bent if bent is not None and bent.response else None))
+                variant = model.model_copy(update={"effects": (*model.effects, *effects)})
+                moved.append((label, np.nan, variant, bent if bent is not None and bent.response else None))
         if not moved:
             return None
 
@@ -91,12 +91,12 @@ class Systematic:
             return np.asarray(basis @ np.linalg.pinv(w.reshape(-1, len(basis)) @ basis))
 
         w = matrix(model)[1]
-        flat, out, seen = w.reshape(-1, len(basis)), [], Counter[str]()
-        for name, u, other, bent in moved:
-            rows, own = matrix(other)
-            turn = inverse(own) @ flat - basis @ basis.T
-            seen[name] += 1
-            label = f"{name}{f' {seen[name]}' if seen[name] > 1 else ''} ({model.identity})"
+        flat, out, count = w.reshape(-1, len(basis)), [], Counter[str]()
+        for name, u, variant, bent in moved:
+            rows, analyzers = matrix(variant)
+            turn = inverse(analyzers) @ flat - basis @ basis.T
+            count[name] += 1
+            label = f"{name}{f' {count[name]}' if count[name] > 1 else ''} ({model.identity})"
             out.append(Direction(label, u, turn, rows.reshape(-1, 16), bent))
         return cls(tuple(out), flat, inverse(w), w.shape[1])
 
@@ -134,8 +134,8 @@ class Systematic:
         counts: list[CountsCorrection | None] = [None] * len(turns)
         if product.has_array("systematic_counts"):
             top, each = float(product.array("full_scale")), product.array("systematic_counts")
-            responses = [{f: c for f, c in zip(FEATURES, one, strict=True) if c.any()} for one in each]
-            counts = [CountsCorrection(top, one, np.zeros((1, 2))) if one else None for one in responses]
+            responses = [{f: c for f, c in zip(FEATURES, row, strict=True) if c.any()} for row in each]
+            counts = [CountsCorrection(top, response, np.zeros((1, 2))) if response else None for response in responses]
         flat = w.reshape(-1, turns.shape[1])
         directions = map(Direction, labels, product.array("systematic_u").tolist(), turns, rows, counts)
         return cls(tuple(directions), flat, np.linalg.pinv(flat, rcond=SMALLEST), w.shape[-2])

@@ -77,9 +77,9 @@ def normalized_mueller(jones: ComplexArray) -> Array:
     top, bottom = j00 * j01.conj(), j10 * j11.conj()
     out[..., 0, 2], out[..., 0, 3] = scale * (top + bottom).real, -scale * (top + bottom).imag
     out[..., 1, 2], out[..., 1, 3] = scale * (top - bottom).real, -scale * (top - bottom).imag
-    left, right = j00 * j10.conj(), j01 * j11.conj()
-    out[..., 2, 0], out[..., 3, 0] = scale * (left + right).real, scale * (left + right).imag
-    out[..., 2, 1], out[..., 3, 1] = scale * (left - right).real, scale * (left - right).imag
+    first, second = j00 * j10.conj(), j01 * j11.conj()
+    out[..., 2, 0], out[..., 3, 0] = scale * (first + second).real, scale * (first + second).imag
+    out[..., 2, 1], out[..., 3, 1] = scale * (first - second).real, scale * (first - second).imag
     diagonal, anti = j00 * j11.conj(), j01 * j10.conj()
     out[..., 2, 2], out[..., 3, 3] = scale * (diagonal + anti).real, scale * (diagonal - anti).real
     out[..., 3, 2], out[..., 2, 3] = scale * (diagonal + anti).imag, scale * (anti - diagonal).imag
@@ -94,16 +94,16 @@ def kinds() -> dict[str, type[BaseModel]]:
     """
     import processing.reflectance as folder
 
-    found: dict[str, type[BaseModel]] = {}
+    models: dict[str, type[BaseModel]] = {}
     for info in pkgutil.iter_modules(folder.__path__):
         module = importlib.import_module(f"processing.reflectance.{info.name}")
         if hasattr(module, "Model"):
-            found[info.name] = module.Model
+            models[info.name] = module.Model
     for entry in entry_points(group=ENTRY_POINT_GROUP):
-        if entry.name in found:
+        if entry.name in models:
             raise ConfigError(f"plug-in {entry.value} offers the model {entry.name!r}, which exists already")
-        found[entry.name] = entry.load()
-    return found
+        models[entry.name] = entry.load()
+    return models
 
 
 def load_reflectance(path: Path | str) -> Any:
@@ -144,8 +144,8 @@ def _model_here(kind: str) -> type[BaseModel] | None:
     """
     import processing.reflectance as folder
 
-    here = {info.name for info in pkgutil.iter_modules(folder.__path__)}
-    if kind not in here or kind in entry_points(group=ENTRY_POINT_GROUP).names:
+    names = {info.name for info in pkgutil.iter_modules(folder.__path__)}
+    if kind not in names or kind in entry_points(group=ENTRY_POINT_GROUP).names:
         return None
     return getattr(importlib.import_module(f"processing.reflectance.{kind}"), "Model", None)
 
@@ -155,7 +155,7 @@ def constants_at(constants: dict[float, Any], wavelength_nm: float, name: str) -
     for key, value in constants.items():
         if abs(key - wavelength_nm) < 0.5:
             return value
-    known = ", ".join(f"{k:g}" for k in constants)
+    wavelengths = ", ".join(f"{k:g}" for k in constants)
     raise ConfigError(
-        f"material {name!r} is given at {known} nm, not at {wavelength_nm:g} nm. Use a material file that has it."
+        f"material {name!r} is given at {wavelengths} nm, not at {wavelength_nm:g} nm. Use a material file that has it."
     )

@@ -115,17 +115,17 @@ class MaterialFit:
         if not self.describes:
             out.append(f"THE MODEL DOES NOT DESCRIBE THESE DATA: reduced chi-square {self.chi_square:.3g}")
         apart = f"small eigenvalues {250 * DEPARTURE:.0f} % apart, which a Mueller image does not have"
-        for what, part in ((apart, self.departure), ("the instrument's uncertainty", self.systematic)):
+        for source, part in ((apart, self.departure), ("the instrument's uncertainty", self.systematic)):
             if part.any():
                 by = ", ".join(f"{n} {e:.2g}" for n, e in zip(self.names, np.sqrt(np.diag(part)), strict=True))
-                out.append(f"of these, {what}: {by}")
+                out.append(f"of these, {source}: {by}")
         return out
 
     def model(self, name: str, wavelength_nm: float) -> BaseModel:
         """The fitted reflectance model."""
         constants = {wavelength_nm: dict(zip(self.names, map(float, self.constants), strict=True))}
-        given = {"kind": self.kind, "name": name, "source": "process fit-material", "constants": constants}
-        return kinds()[self.kind].model_validate(given)
+        fields = {"kind": self.kind, "name": name, "source": "process fit-material", "constants": constants}
+        return kinds()[self.kind].model_validate(fields)
 
 
 def evenly(good: NDArray[np.bool_], limit: int) -> NDArray[np.int64]:
@@ -196,8 +196,8 @@ def result_of(
         # A constant at its bound is not known there: without its share the others would look sure.
         bread = np.linalg.inv(curvature + np.diag(np.where(inside, 0.0, 1 / width**2)))
         prior = np.diag(np.where(inside, 0.0, 1 / width**2))
-        whole = bread @ (scores.T @ scores + prior) @ bread
-        covariance[np.ix_(inside, inside)] = whole[np.ix_(inside, inside)]
+        full = bread @ (scores.T @ scores + prior) @ bread
+        covariance[np.ix_(inside, inside)] = full[np.ix_(inside, inside)]
         if departures is not None:
             departure = bread @ departures.T @ departures @ bread
     systematic = off.T @ off

@@ -77,14 +77,14 @@ def fit_values(
     # The ridge is for values without noise.
     c = c[keep] + 1e-9 * np.trace(c[keep], axis1=1, axis2=2)[:, None, None] * np.eye(len(x))
     model = _Forward(geometry[keep])
-    others = [(np.asarray(v, dtype=float)[:, keep], np.asarray(w, dtype=float)) for v, w in moved]
+    pairs = [(np.asarray(v, dtype=float)[:, keep], np.asarray(w, dtype=float)) for v, w in moved]
     if not correlation and np.linalg.matrix_rank(r) == 16:
         back = np.linalg.pinv(r)
-        each = [(np.linalg.pinv(w) @ v).T for v, w in others]
+        each = [(np.linalg.pinv(w) @ v).T for v, w in pairs]
         return _fit_dominant(model, (back @ x[:, keep]).T, back @ c @ back.T, each)
     whiten = np.linalg.inv(np.linalg.cholesky(c))
-    own, *rest = (_Correlation.of(model, v, w, whiten) for v, w in [(x[:, keep], r), *others])
-    return _fit_correlation(own, rest)
+    reference, *variants = (_Correlation.of(model, v, w, whiten) for v, w in [(x[:, keep], r), *pairs])
+    return _fit_correlation(reference, variants)
 
 
 def _fit_dominant(model: "_Forward", data: Array, covariance: Array, moved: Sequence[Array]) -> MaterialFit:
@@ -105,30 +105,30 @@ def _fit_dominant(model: "_Forward", data: Array, covariance: Array, moved: Sequ
     bounds = list(zip(DIFFUSE.lower.tolist(), DIFFUSE.upper.tolist(), strict=True))
     fits = [minimize(unlike, np.array(s), method="L-BFGS-B", bounds=bounds, tol=1e-13) for s in DIFFUSE.starts]
     # The search ends where its sum stops changing; the root of its slope is sharper.
-    found = _root(model, np.asarray(min(fits, key=lambda fit: float(fit.fun)).x), scaled)
-    off = np.array([_root(model, found, other * weight) - found for other in moved]).reshape(-1, 4)
-    scores, curvature = _slopes(model, found, scaled)
-    parts = _neighbours(model.mueller(found).reshape(-1, 16))
+    constants = _root(model, np.asarray(min(fits, key=lambda fit: float(fit.fun)).x), scaled)
+    off = np.array([_root(model, constants, values * weight) - constants for values in moved]).reshape(-1, 4)
+    scores, curvature = _slopes(model, constants, scaled)
+    parts = _neighbours(model.mueller(constants).reshape(-1, 16))
     noise = np.einsum("nki,nij,nlj->nkl", parts, covariance, parts, optimize=True)
     whiten = np.linalg.inv(np.linalg.cholesky(noise)) @ parts
-    seen, *changes = (np.einsum("nki,ni->nk", whiten, values) for values in (data, *moved))
-    square = unexplained(seen, [change - seen for change in changes])
+    residual, *changes = (np.einsum("nki,ni->nk", whiten, values) for values in (data, *moved))
+    square = unexplained(residual, [change - residual for change in changes])
     free = 6 * len(data) - 4
     return result_of(
-        found, -curvature.sum(axis=0), scores, square, free=free, method="dominant process", off=off, of=DIFFUSE
+        constants, -curvature.sum(axis=0), scores, square, free=free, method="dominant process", off=off, of=DIFFUSE
     )
 
 
 def _root(model: "_Forward", start: Array, scaled: Array) -> Array:
     """Constants near to `start` at which the slope of sum(scaled * m0) is zero."""
-    found = start.copy()
+    constants = start.copy()
     for _ in range(2):
-        slope, curvature = (np.sum(part, axis=0) for part in _slopes(model, found, scaled))
-        inside = DIFFUSE.inside(found)
+        slope, curvature = (np.sum(part, axis=0) for part in _slopes(model, constants, scaled))
+        inside = DIFFUSE.inside(constants)
         if inside.any():
             step = np.linalg.lstsq(curvature[np.ix_(inside, inside)], slope[inside], rcond=1e-10)[0]
-            found[inside] = np.clip(found[inside] - step, DIFFUSE.lower[inside], DIFFUSE.upper[inside])
-    return found
+            constants[inside] = np.clip(constants[inside] - step, DIFFUSE.lower[inside], DIFFUSE.upper[inside])
+    return constants
 
 
 def _slopes(model: "_Forward", q: Array, scaled: Array) -> tuple[Array, Array]:
@@ -155,14 +155,14 @@ def _slopes(model: "_Forward", q: Array, scaled: Array) -> tuple[Array, Array]:
 
 def _vectors(m0: Array) -> ComplexArray:
     """Orthonormal vectors (N, 4, 4) of Jones matrices, that of m0 (N, 16) first, all smooth over the pixels."""
-    found = [np.linalg.eigh(coherency(m0.reshape(-1, 4, 4)))[1][..., -1]]
-    jones = found[0].reshape(-1, 2, 2)
+    vectors = [np.linalg.eigh(coherency(m0.reshape(-1, 4, 4)))[1][..., -1]]
+    jones = vectors[0].reshape(-1, 2, 2)
     for pauli in _PAULI:
         vector = (jones @ pauli).reshape(-1, 4)
-        for other in found:
-            vector = vector - other * np.sum(other.conj() * vector, axis=1, keepdims=True)
-        found.append(vector / np.linalg.norm(vector, axis=1, keepdims=True))
-    return np.stack(found, axis=1)
+        for previous in vectors:
+            vector = vector - previous * np.sum(previous.conj() * vector, axis=1, keepdims=True)
+        vectors.append(vector / np.linalg.norm(vector, axis=1, keepdims=True))
+    return np.stack(vectors, axis=1)
 
 
 def _mixed(first: ComplexArray, second: ComplexArray) -> Array:
@@ -180,8 +180,8 @@ def _neighbours(m0: Array) -> Array:
 def _departures(m0: Array) -> Array:
     """Changes (8, N, 16) of M/m00 by small eigenvalues that differ, one standard deviation each."""
     v = _vectors(m0)
-    own = [_mixed(v[:, k], v[:, k]) for k in (1, 2, 3)]
-    parts = [(own[0] - own[1]) / 2, (own[0] + own[1] - 2 * own[2]) / np.sqrt(12)]
+    diagonal = [_mixed(v[:, k], v[:, k]) for k in (1, 2, 3)]
+    parts = [(diagonal[0] - diagonal[1]) / 2, (diagonal[0] + diagonal[1] - 2 * diagonal[2]) / np.sqrt(12)]
     parts += [_mixed(v[:, i], turn * v[:, j]) / np.sqrt(2) for i, j in ((1, 2), (1, 3), (2, 3)) for turn in (1, 1j)]
     # Hermitian matrices of unit norm, over sqrt(2); with 8 of them the three eigenvalues have this deviation.
     return np.asarray(DEPARTURE * np.sqrt(3 / 8) * np.sqrt(2) * np.stack(parts))
@@ -223,30 +223,30 @@ class _Correlation:
 
 def _fit_correlation(own: _Correlation, moved: Sequence[_Correlation]) -> MaterialFit:
     """Fit by linear correlation; `moved` are the same data by an instrument that is off."""
-    found, jacobian = search(own.residual, DIFFUSE)
-    off = np.array([search(other.residual, DIFFUSE, found)[0] - found for other in moved]).reshape(-1, 4)
-    left = own.residual(found)
-    changes = [other.residual(found) - left for other in moved]
-    modelled, overlap = own.parts(found)
+    constants, jacobian = search(own.residual, DIFFUSE)
+    off = np.array([search(variant.residual, DIFFUSE, constants)[0] - constants for variant in moved]).reshape(-1, 4)
+    residual = own.residual(constants)
+    changes = [variant.residual(constants) - residual for variant in moved]
+    modelled, overlap = own.parts(constants)
     with np.errstate(invalid="ignore", divide="ignore"):
         rho = overlap[:, 0] / (np.linalg.norm(modelled, axis=1) * np.linalg.norm(own.data, axis=1))
-    slopes = jacobian.reshape(*left.shape, 4)
+    slopes = jacobian.reshape(*residual.shape, 4)
     unit = modelled / np.maximum(np.linalg.norm(modelled, axis=1, keepdims=True), 1e-300)
     departures, unlike = [], 0.0
-    for change in _departures(own.model.mueller(found).reshape(-1, 16)):
+    for change in _departures(own.model.mueller(constants).reshape(-1, 16)):
         extra = own.polarized(own.light[:, None] * np.einsum("nki,ni->nk", own.rows, change))
         extra -= unit * np.sum(unit * extra, axis=1, keepdims=True)
         departures.append(np.einsum("nkp,nk->p", slopes, extra))
         unlike += float(np.sum(extra**2))
-    square, free = unexplained(left, changes), left.size - 2 * len(left) - 4
+    square, free = unexplained(residual, changes), residual.size - 2 * len(residual) - 4
     # Eigenvalues may differ by more than usual: by as much as makes the residual.
     more = max(1.0, float(np.sqrt(max(square - free, 0) / unlike)))
-    scores, curvature = np.einsum("nkp,nk->np", slopes, left), jacobian.T @ jacobian
+    scores, curvature = np.einsum("nkp,nk->np", slopes, residual), jacobian.T @ jacobian
     method, apart = "linear correlation", more * np.array(departures)
     result = result_of(
-        found, curvature, scores, square, free=free, method=method, off=off, departures=apart, of=DIFFUSE
+        constants, curvature, scores, square, free=free, method=method, off=off, departures=apart, of=DIFFUSE
     )
-    share = float(np.sqrt(np.sum(left**2) / np.sum(own.data**2)))
+    share = float(np.sqrt(np.sum(residual**2) / np.sum(own.data**2)))
     return replace(result, residual=share, correlation=float(np.nanmean(rho)))
 
 

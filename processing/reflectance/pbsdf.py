@@ -120,10 +120,10 @@ def load(path: Path | str, white_m00: float = 1.0, only_nm: float | None = None)
         raise TableError(f"{path} lacks {', '.join(sorted(lacking))}: it is no pBRDF.")
     axes = TableAxes("renderer")
     stored = (fields["theta_h"], fields["theta_d"], fields["phi_d"])
-    for values, wanted, name in zip(
+    for values, expected, name in zip(
         stored, (axes.theta_h_deg, axes.theta_d_deg, axes.phi_d_deg), ("theta_h", "theta_d", "phi_d"), strict=True
     ):
-        if values.size != wanted.size or not np.allclose(np.rad2deg(values.reshape(-1)), wanted, atol=0.02):
+        if values.size != expected.size or not np.allclose(np.rad2deg(values.reshape(-1)), expected, atol=0.02):
             raise TableError(f"{path}: its {name} axis is not the 91 x 91 x 361 layout that the renderer's files have")
     wavelengths, shape = fields["wvls"].reshape(-1), fields["M"].shape
     if shape != (*SHAPE[::-1], wavelengths.size, 4, 4) or fields["M"].dtype.kind != "f":
@@ -139,9 +139,9 @@ def load(path: Path | str, white_m00: float = 1.0, only_nm: float | None = None)
             continue
         m = np.moveaxis(fields["M"][..., k, :, :].reshape(*SHAPE[::-1], 16), -1, 0).transpose(0, 3, 2, 1)
         values = m[..., :-1] * (white_m00 * np.pi * np.maximum(cos_i, 0.0))[..., :-1]
-        seen = (cos_i > 0)[..., :-1] & np.isfinite(values).all(axis=0)
+        is_lit = (cos_i > 0)[..., :-1] & np.isfinite(values).all(axis=0)
         table = ScatteringTable(MUELLER, float(wavelength), "renderer", frames="renderer")
-        table.add(Angles(*(a[..., :-1][seen] for a in angles)), values[:, seen])
+        table.add(Angles(*(a[..., :-1][is_lit] for a in angles)), values[:, is_lit])
         tables[int(wavelength)] = table
     return tables
 
@@ -159,23 +159,23 @@ def model_table(
         raise TableError("this kind of material has no brightness, only a dominant process. Give a rough_plastic.")
     axes = TableAxes("renderer")
     table = ScatteringTable(MUELLER, wavelength_nm, "renderer", frames="renderer", scale_u=np.nan)
-    theta_h, *others = (np.deg2rad(a) for a in (axes.theta_h_deg, axes.theta_d_deg, axes.phi_d_deg[:-1]))
+    theta_h, *differences = (np.deg2rad(a) for a in (axes.theta_h_deg, axes.theta_d_deg, axes.phi_d_deg[:-1]))
     parts = np.split(theta_h, np.arange(13, len(theta_h), 13))
     for k, part in enumerate(parts):
-        angles = Angles(*(a.reshape(-1) for a in np.meshgrid(part, *others, indexing="ij")))
+        angles = Angles(*(a.reshape(-1) for a in np.meshgrid(part, *differences, indexing="ij")))
         # y is the axis s of both beams, also where source and camera coincide.
         points = ScatteringGeometry(*directions(*angles), up=np.array([1.0, 0.0, 0.0]))
         values = model.brdf(points, wavelength_nm).reshape(-1, 16).T
-        seen = values[0] > 0
-        table.add(Angles(*(a[seen] for a in angles)), values[:, seen])
+        is_lit = values[0] > 0
+        table.add(Angles(*(a[is_lit] for a in angles)), values[:, is_lit])
         if progress:
             progress(k + 1, len(parts))
     return table
 
 
 def _check(table: ScatteringTable, white_m00: float, uncertainty: bool) -> None:
-    wanted = (MUELLER, "renderer", "renderer")
-    if (table.quantities, table.axes.layout, table.frames) != wanted:
+    expected = (MUELLER, "renderer", "renderer")
+    if (table.quantities, table.axes.layout, table.frames) != expected:
         raise TableError(
             f"a .pbsdf needs a table of m00..m33 in renderer frames and layout; this one holds "
             f"{table.quantities[0]}.. in {table.frames or 'no'} frames, layout {table.axes.layout!r}"

@@ -50,18 +50,18 @@ def fit_plastic(
         return np.asarray(data - modelled * np.sum(modelled * data, axis=1, keepdims=True) / square)
 
     each = []
-    for own, leads in [(x, r), *((np.asarray(v, dtype=float), np.asarray(w, dtype=float)) for v, w in moved)]:
-        each.append((np.einsum("nij,jn->ni", whiten, own[:, keep]), whiten @ leads))
-    found, jacobian = search(partial(residual, data=each[0][0], back=each[0][1]), PLASTIC)
-    off = [search(partial(residual, data=v, back=w), PLASTIC, found)[0] - found for v, w in each[1:]]
-    left, *changed = (residual(found, *data) for data in each)
-    square = unexplained(left, [change - left for change in changed])
+    for signal, leads in [(x, r), *((np.asarray(v, dtype=float), np.asarray(w, dtype=float)) for v, w in moved)]:
+        each.append((np.einsum("nij,jn->ni", whiten, signal[:, keep]), whiten @ leads))
+    constants, jacobian = search(partial(residual, data=each[0][0], back=each[0][1]), PLASTIC)
+    off = [search(partial(residual, data=v, back=w), PLASTIC, constants)[0] - constants for v, w in each[1:]]
+    base, *changed = (residual(constants, *data) for data in each)
+    square = unexplained(base, [change - base for change in changed])
     return result_of(
-        found,
+        constants,
         jacobian.T @ jacobian,
-        np.einsum("nkp,nk->np", jacobian.reshape(*left.shape, 3), left),
+        np.einsum("nkp,nk->np", jacobian.reshape(*base.shape, 3), base),
         square,
-        free=left.size - len(left) - 3,
+        free=base.size - len(base) - 3,
         method="sum of two processes",
         off=np.array(off).reshape(-1, 3),
         of=PLASTIC,

@@ -23,18 +23,18 @@ def shared_variance(
     correlation : (2 R + 1, 2 R + 1), of two pixels by their distance in rows and columns, 1 at the centre.
     """
     sigma = np.where((bins >= 0) & np.isfinite(stderr), stderr, 0.0)
-    found = sigma**2
+    variance = sigma**2
     reach = correlation.shape[0] // 2
     rows, columns = bins.shape
     for dy, dx in np.argwhere(np.abs(correlation) > LEAST) - reach:
         # Each pair once; it counts for both of its pixels.
         if (dy, dx) <= (0, 0) or dy >= rows or abs(dx) >= columns:
             continue
-        here = np.s_[: rows - dy, max(0, -dx) : columns - max(0, dx)]
-        there = np.s_[dy:, max(0, dx) : columns - max(0, -dx)]
+        first = np.s_[: rows - dy, max(0, -dx) : columns - max(0, dx)]
+        second = np.s_[dy:, max(0, dx) : columns - max(0, -dx)]
         pair = np.where(
-            bins[here] == bins[there], correlation[reach + dy, reach + dx] * sigma[here] * sigma[there], 0.0
+            bins[first] == bins[second], correlation[reach + dy, reach + dx] * sigma[first] * sigma[second], 0.0
         )
-        found[here] += pair
-        found[there] += pair
-    return np.asarray(found)
+        variance[first] += pair
+        variance[second] += pair
+    return np.asarray(variance)

@@ -149,11 +149,11 @@ class ScatteringTable:
             for plane, more in zip(v[quantities:], further, strict=True):
                 more += np.bincount(rows[samples], plane[samples], minlength=self.count.size)
             return
-        found, of_sample, size = np.unique(rows[samples], return_inverse=True, return_counts=True)
+        filled, of_sample, size = np.unique(rows[samples], return_inverse=True, return_counts=True)
         group = np.full(rows.size, -1, dtype=np.int32)
         group[samples] = of_sample
         for start, means in zip(range(0, len(further), quantities), uncertainty(BinGroups(group, size)), strict=True):
-            further[start : start + quantities, found] += means * size
+            further[start : start + quantities, filled] += means * size
 
     @property
     def units(self) -> str:
@@ -185,12 +185,12 @@ class ScatteringTable:
     @property
     def uncertainties(self) -> dict[str, Array]:
         """Standard uncertainties (quantities, bins) of the mean, as far as known: `u_noise`, `u_systematic`."""
-        n, found = len(self.quantities), {}
+        n, planes = len(self.quantities), {}
         if self.has_noise:
-            found["u_noise"] = np.sqrt(self._sum[n : 2 * n]) / self.count
+            planes["u_noise"] = np.sqrt(self._sum[n : 2 * n]) / self.count
         if self.inputs:
-            found["u_systematic"] = np.sqrt(np.square(self.directions).sum(axis=0))
-        return found
+            planes["u_systematic"] = np.sqrt(np.square(self.directions).sum(axis=0))
+        return planes
 
     def lookup(self, angles: Angles, min_count: int = 1, of: Array | None = None) -> Array:
         """Mean (quantities, ...) at directions (...) in radians, of the nearest bin; NaN with too few samples.
@@ -202,8 +202,8 @@ class ScatteringTable:
         rows = np.where(bins >= 0, self._row[bins], -1)
         if self.bins.size == 0:
             return np.full((*of.shape[:-1], *rows.shape), np.nan)
-        known = (rows >= 0) & (self.count[rows] >= min_count)
-        return np.where(known, of[..., rows], np.nan)
+        is_filled = (rows >= 0) & (self.count[rows] >= min_count)
+        return np.where(is_filled, of[..., rows], np.nan)
 
     def counts(self, angles: Angles) -> NDArray[np.int64]:
         """Number of samples (...) of the bin of each direction."""
@@ -228,8 +228,8 @@ class ScatteringTable:
             raise TableError(f"tables differ and cannot be merged: {mine} and {theirs}")
         quantities, start = len(self.quantities), len(self.quantities) * (1 + self.has_noise)
         parts = [t._sum[start:].reshape(-1, quantities, t.count.size) for t in (self, other)]
-        self.inputs, (own, more) = of_all_inputs([self.inputs, other.inputs], parts)
-        self._sum = np.concatenate([self._sum[:start], own.reshape(-1, self.count.size)])
+        self.inputs, (base, more) = of_all_inputs([self.inputs, other.inputs], parts)
+        self._sum = np.concatenate([self._sum[:start], base.reshape(-1, self.count.size)])
         rows = other.bins.copy()
         self._claim(rows)
         self.count[rows] += other.count
@@ -238,11 +238,11 @@ class ScatteringTable:
 
     def _claim(self, bins: NDArray[np.int32]) -> None:
         # Replaces each bin by its row, and gives a row to the new ones.
-        found = np.empty(bins.size, dtype=np.int32)
-        new = claim_rows(bins, self._row, self.bins.size, found)
+        new_bins = np.empty(bins.size, dtype=np.int32)
+        new = claim_rows(bins, self._row, self.bins.size, new_bins)
         if new:
             grown = np.zeros((self.planes, new))
-            self.bins = np.concatenate([self.bins, found[:new]])
+            self.bins = np.concatenate([self.bins, new_bins[:new]])
             self.count = np.concatenate([self.count, np.zeros(new, dtype=np.int64)])
             self._sum = np.hstack([self._sum, grown])
             self._square = np.hstack([self._square, grown[: len(self.quantities)]])

@@ -23,7 +23,7 @@ def fact_lines(facts: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
 def fact_words(value: Any) -> str:
     """A number with five digits, a truth as yes or no, what has no value as none; lists and mappings item by item."""
     if isinstance(value, dict):
-        return ", ".join(f"{name.replace('_', ' ')} {fact_words(one)}" for name, one in value.items()) or "none"
+        return ", ".join(f"{name.replace('_', ' ')} {fact_words(item)}" for name, item in value.items()) or "none"
     if isinstance(value, list | tuple):
         return ", ".join(map(fact_words, value)) or "none"
     if isinstance(value, bool):
@@ -35,8 +35,8 @@ def fact_words(value: Any) -> str:
 
 def _inputs(text: str) -> str:
     """A text; where it lists directions of several inputs each, as a;b, the inputs that most of them have."""
-    directions = [one.split(", ") for one in text.split("; ")]
-    count = Counter(name for one in directions for name in one)
+    directions = [direction.split(", ") for direction in text.split("; ")]
+    count = Counter(name for direction in directions for name in direction)
     if len(directions) < 2 or max(len(count), len(directions)) <= MOST_NAMED:
         return text
     named = ", ".join(name for name, _ in count.most_common(MOST_NAMED))

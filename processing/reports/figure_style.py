@@ -91,8 +91,8 @@ def _map(figure: Figure, axis: Any, values: NDArray[Any], label: str, **keywords
 
 def _poincare(axis: Any, stokes: NDArray[np.floating]) -> None:
     """Pixels (3, n) inside the Poincare sphere: full polarization lies on its surface, none at its centre."""
-    known = stokes[:, np.isfinite(stokes).all(axis=0)]
-    known = known[:, :: max(1, known.shape[1] // SPHERE_PIXELS)]
+    pixels = stokes[:, np.isfinite(stokes).all(axis=0)]
+    pixels = pixels[:, :: max(1, pixels.shape[1] // SPHERE_PIXELS)]
     turn, height = np.linspace(0, 2 * np.pi, 73), np.linspace(-np.pi / 2, np.pi / 2, 13)
     round_ = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)])
     for angle in height[2:-1:2]:
@@ -105,7 +105,7 @@ def _poincare(axis: Any, stokes: NDArray[np.floating]) -> None:
         line[k] = (0, 1.25)
         axis.plot(*line, color="black", linewidth=0.8)
         axis.text(*line[:, 1] * 1.08, f"$S_{k + 1}/S_0$", fontsize=8, ha="center")
-    axis.scatter(*known, s=3, c="tab:red", depthshade=False, linewidths=0)
+    axis.scatter(*pixels, s=3, c="tab:red", depthshade=False, linewidths=0)
     axis.set_title("Poincaré sphere", fontsize=10)
     axis.set_box_aspect((1, 1, 1))
     axis.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1))

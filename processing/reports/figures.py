@@ -66,7 +66,7 @@ def product_figure(product: Product) -> Figure:
     if product.kind == "xi0":
         xi0, errors, valid = (thin(product.get(name)) for name in ("xi0", "xi0_errors", "valid"))
         shown = np.where(valid > 0, xi0, np.nan)
-        known = np.where(errors <= UNKNOWN_XI0, errors, np.nan)
+        limited = np.where(errors <= UNKNOWN_XI0, errors, np.nan)
         panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
             (
                 f"$\\xi_0$ (grey: not valid, {100 * np.mean(valid == 0):.0f} % of the image)",
@@ -75,7 +75,7 @@ def product_figure(product: Product) -> Figure:
             ),
             (
                 f"standard error of $\\xi_0$ (grey: > {UNKNOWN_XI0:g})",
-                known,
+                limited,
                 {"cmap": "magma", "vmin": 0, "vmax": max(percentile(errors[valid > 0], 95), 1e-6)},
             ),
         ]
@@ -99,8 +99,8 @@ def mueller_figure(elements: NDArray[Any], lit: NDArray[np.bool_], title: str, s
     m00 = elements[0, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         normalized = np.where(lit, elements / m00, np.nan)
-    rest = normalized.reshape(16, *m00.shape)[1:]
-    limit = float(np.clip(percentile(np.abs(rest), 99.5), 1e-6, 1.0))
+    ratios = normalized.reshape(16, *m00.shape)[1:]
+    limit = float(np.clip(percentile(np.abs(ratios), 99.5), 1e-6, 1.0))
     figure = Figure(figsize=(9.5, 8.6 * max(0.45, m00.shape[0] / max(m00.shape[1], 1)) + 0.8), layout="constrained")
     panels = figure.subplots(4, 4)
     shown: Any = None
@@ -119,7 +119,7 @@ def mueller_figure(elements: NDArray[Any], lit: NDArray[np.bool_], title: str, s
                 continue
             shown = panel.imshow(normalized[i, j], cmap=SIGNED, vmin=-limit, vmax=limit, interpolation="nearest")
     label = "$m_{ij}/m_{00}$, instrument frames (first panel: $m_{00}$; plain grey: too dark)"
-    figure.colorbar(shown, ax=panels, shrink=0.8, label=label, extend=clipped(rest, -limit, limit))
+    figure.colorbar(shown, ax=panels, shrink=0.8, label=label, extend=clipped(ratios, -limit, limit))
     entitle(figure, title, simulated)
     return figure
 
@@ -193,16 +193,16 @@ def _polarimeter_figure(product: Product, stokes: NDArray[Any], errors: NDArray[
         linear = np.hypot(s1, s2)
         noise = np.hypot(s1 * errors[2], s2 * errors[1]) / (2 * linear**2 * stokes[0])
         degree = np.sqrt(s1**2 + s2**2 + s3**2)
-        found = {
+        maps = {
             "dop": degree,
             "dolp": linear,
             "docp": s3,
             "aolp_deg": np.rad2deg(np.arctan2(s2, s1)) / 2 % 180,
             "ellipticity_deg": np.rad2deg(np.arctan2(s3, linear)) / 2,
         }
-    found |= {name: np.where(lit, thin(product.get(name)), np.nan) for name in found if name in product.names}
+    maps |= {name: np.where(lit, thin(product.get(name)), np.nan) for name in maps if name in product.names}
     for name, error in (("aolp_deg", noise), ("ellipticity_deg", errors[1:].max(axis=0) / (2 * degree * stokes[0]))):
-        found[name] = np.where(np.rad2deg(error) > WORST_ORIENTATION_DEG, np.nan, found[name])
+        maps[name] = np.where(np.rad2deg(error) > WORST_ORIENTATION_DEG, np.nan, maps[name])
     panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
         ("$S_0$ / counts", stokes[0], {"cmap": "gray", "vmin": 0})
     ]
@@ -210,12 +210,12 @@ def _polarimeter_figure(product: Product, stokes: NDArray[Any], errors: NDArray[
         limit = max(percentile(np.abs(shown), 99.5), 1e-6) if np.isfinite(shown).any() else 1.0
         panels.append((label, shown, {"cmap": SIGNED, "vmin": -limit, "vmax": limit}))
     for label, name in (("degree of polarization", "dop"), ("degree of linear polarization", "dolp")):
-        panels.append((label, found[name], {"cmap": "viridis", "vmin": 0, "vmax": upper_end(found[name])}))
-    circular = np.abs(found["docp"])
+        panels.append((label, maps[name], {"cmap": "viridis", "vmin": 0, "vmax": upper_end(maps[name])}))
+    circular = np.abs(maps["docp"])
     panels += [
         ("degree of circular polarization", circular, {"cmap": "viridis", "vmin": 0, "vmax": upper_end(circular)}),
-        ("angle of linear polarization, PSA frame / degrees", found["aolp_deg"], CYCLIC),
-        ("ellipticity angle / degrees", found["ellipticity_deg"], {"cmap": SIGNED, "vmin": -45, "vmax": 45}),
+        ("angle of linear polarization, PSA frame / degrees", maps["aolp_deg"], CYCLIC),
+        ("ellipticity angle / degrees", maps["ellipticity_deg"], {"cmap": SIGNED, "vmin": -45, "vmax": 45}),
     ]
     # Where S3 is not determined, nothing follows from it.
     shown_panels = [panel for panel in panels if np.isfinite(panel[1]).any()]

@@ -114,11 +114,11 @@ def tables_figure(
     top = float(np.percentile(finite, 99.5)) if finite.size else 1.0
     spread = np.abs(b - a)[np.isfinite(b - a)]
     limit = max(float(np.percentile(spread, 99)), 1e-6) if spread.size else 1.0
-    both = {"vmin": 0.25, "vmax": top}
+    scale = {"vmin": 0.25, "vmax": top}
     return grid_figure(
         [
-            ("$\\xi_0$, reference", a, both),
-            ("$\\xi_0$, other", b, both),
+            ("$\\xi_0$, reference", a, scale),
+            ("$\\xi_0$, other", b, scale),
             ("other - reference", b - a, {"cmap": SIGNED, "vmin": -limit, "vmax": limit}),
         ],
         f"virtual object, {reference.wavelength_nm:g} nm, $\\Omega$ = {omega_deg:g} degrees",

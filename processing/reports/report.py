@@ -54,8 +54,8 @@ def collect(sources: Sequence[Path]) -> list[Path]:
         if source.is_dir():
             inside = [p for p in source.rglob("*") if p.suffix in SUFFIXES and p.is_file()]
             twins = [p for p in inside if p.suffix in PICTURES and p.with_suffix(".h5").is_file()]
-            kept = set(inside) - set(twins)
-            files += sorted(kept, key=lambda p: (p.suffix == ".h5", _date(p), p.name))
+            remaining = set(inside) - set(twins)
+            files += sorted(remaining, key=lambda p: (p.suffix == ".h5", _date(p), p.name))
         elif source.is_file():
             if source.suffix not in SUFFIXES:
                 raise ProcessError(f"{source}: a report takes {', '.join(SUFFIXES)} files.")
@@ -96,8 +96,8 @@ def write_report(
     ------
     ProcessError : nothing to report, `out` exists, or simulated and measured data are mixed.
     """
-    asked = sha256("\0".join([title, *map(os.path.realpath, sources)]).encode()).hexdigest()
-    mark = f"<!-- umov report {asked} -->\n"
+    key = sha256("\0".join([title, *map(os.path.realpath, sources)]).encode()).hexdigest()
+    mark = f"<!-- umov report {key} -->\n"
     require_place(out, overwrite or _begins_with(out, mark))
     files = [f for f in collect(sources) if os.path.realpath(f) != os.path.realpath(out)]
     simulated = _kind_of_data(files)
@@ -113,8 +113,8 @@ def write_report(
         sections.append(section)
         if progress:
             progress(count, len(files))
-    made = f"Made by umov {version('umov')} on {datetime.now(UTC).isoformat(timespec='seconds')}. Files: {len(files)}."
-    write_whole_text(out, mark + render(title, simulated, made, sections))
+    note = f"Made by umov {version('umov')} on {datetime.now(UTC).isoformat(timespec='seconds')}. Files: {len(files)}."
+    write_whole_text(out, mark + render(title, simulated, note, sections))
     return out
 
 
@@ -138,18 +138,18 @@ def _section(path: Path) -> ReportSection:
 
 def _kind_of_data(files: Sequence[Path]) -> bool:
     """Whether the captures, products and tables are simulated; ProcessError if some are and some are not."""
-    found: dict[bool, Path] = {}
+    first: dict[bool, Path] = {}
     for file in files:
         if file.suffix != ".h5":
             continue
         # A file of another program says nothing; its section says what it is.
         with suppress(CaptureError):
-            found.setdefault(_is_simulated(file), file)
-    if len(found) == 2:
+            first.setdefault(_is_simulated(file), file)
+    if len(first) == 2:
         raise ProcessError(
-            f"{found[True]} is simulated and {found[False]} is measured; they are never mixed. Make one report of each."
+            f"{first[True]} is simulated and {first[False]} is measured; they are never mixed. Make one report of each."
         )
-    return True in found
+    return True in first
 
 
 def _is_simulated(path: Path) -> bool:
@@ -168,8 +168,8 @@ def _capture(path: Path) -> ReportSection:
         header, closing = capture.header, capture.closing
         warnings = [str(m) for m in closing.get("messages", [])]
         if cut := closing.get("left_out"):
-            told = ", ".join(f"{number} of {name}" for name, number in cut.items())
-            warnings.append(f"the closing record was too long for its place; left out: {told}")
+            cuts = ", ".join(f"{number} of {name}" for name, number in cut.items())
+            warnings.append(f"the closing record was too long for its place; left out: {cuts}")
         if len(capture.segments) > 1:
             runs = "; ".join(
                 f"{run.begun}, {run.status}, states {_range(capture.done[run.states])}" for run in capture.segments
@@ -217,9 +217,9 @@ def _product(path: Path) -> ReportSection:
             title = product.header.title
             drawn = map_figure([("residual rms / counts", residual, {"cmap": "magma"})], title, product.simulated)
             if (maps := mueller_maps(product, title)) is not None:
-                whole = int(product.facts.get("rank", 16)) == 16
-                what = "coherency eigenvalues, xi0 and its error, DoLP, AoLP" if whole else "DoLP, AoLP"
-                figures.append(Figure(png(maps), what))
+                is_complete = int(product.facts.get("rank", 16)) == 16
+                caption = "coherency eigenvalues, xi0 and its error, DoLP, AoLP" if is_complete else "DoLP, AoLP"
+                figures.append(Figure(png(maps), caption))
             figures.append(Figure(png(drawn), "residual of the fit"))
         datasets = [("dataset", "unit", "what it is")]
         datasets += [(name, product.units(name), product.long_name(name)) for name in product.names]
@@ -246,15 +246,15 @@ def _budgets(product: Product) -> list[tuple[str, list[tuple[str, ...]]]]:
     if product.kind not in ("mueller", "stokes"):
         return []
     try:
-        found = mean_of([product.path], parse_region(None, product.shape))
+        means = mean_of([product.path], parse_region(None, product.shape))
     except ProcessError:
         # No pixel of the middle can be used.
         return []
     title = "uncertainty budget of {} = {:.6g} {}, mean of the middle half; {}"
     return [
-        (title.format(one.name, one.value, one.unit, one.interval_text), [BUDGET_COLUMNS, *one.budget_lines])
-        for one in found
-        if one.name in BUDGETED
+        (title.format(mean.name, mean.value, mean.unit, mean.interval_text), [BUDGET_COLUMNS, *mean.budget_lines])
+        for mean in means
+        if mean.name in BUDGETED
     ]
 
 

@@ -89,12 +89,12 @@ class FileStep(OfFiles, ABC):
         in the first digits of what it is made of.
         """
         path, record = Path(path) if path else self.usual_path, self.record()
-        wanted = record.made_of
-        own = path.with_name(f"{path.stem}-{wanted[:8]}{path.suffix}")
-        for candidate in (path, own):
-            if made_of(candidate) == wanted:
+        content = record.made_of
+        own_path = path.with_name(f"{path.stem}-{content[:8]}{path.suffix}")
+        for candidate in (path, own_path):
+            if made_of(candidate) == content:
                 return Found(candidate, True)
-        out = own if path.exists() else path
+        out = own_path if path.exists() else path
         require_place(out, overwrite=False)
         self._write(out, record, False, progress)
         return Found(out, False)

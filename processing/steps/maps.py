@@ -154,9 +154,9 @@ class Extrapolation(FileStep):
 
 def geometry_identities(geometry: Path) -> list[dict[str, object]]:
     """Identities of a geometry file and of the mesh that it names."""
-    found = [file_identity(geometry, "geometry")]
+    identities = [file_identity(geometry, "geometry")]
     mesh = getattr(ViewingGeometry.load(geometry).shape, "file", None)
-    return found if mesh is None else [*found, file_identity(Path(mesh), "mesh")]
+    return identities if mesh is None else [*identities, file_identity(Path(mesh), "mesh")]
 
 
 def _modelled(source: Path, geometry: Path, material: Path) -> tuple[dict[str, object], ...]:

@@ -74,5 +74,5 @@ class MaterialFitting(OfFiles):
 
     def fitted(self) -> FittedMaterial:
         """Fit, see `processing.maps.material_fit.fit_products`."""
-        found = fit_products(self.sources, self.geometry, correlation=self.correlation, kind=self.kind)
-        return FittedMaterial(*found, self.name, self.record())
+        fit = fit_products(self.sources, self.geometry, correlation=self.correlation, kind=self.kind)
+        return FittedMaterial(*fit, self.name, self.record())

@@ -95,9 +95,9 @@ class Reduction(FileStep):
         return Step("reduce", {"capture": self.capture.name} | options, inputs)
 
     def _refuse(self, options: tuple[str, ...], why: str) -> None:
-        given = [f"--{name.replace('_', '-')}" for name in options if getattr(self, name)]
-        if given:
-            raise ProcessError(f"{' '.join(given)}: {self.capture} is {why}.")
+        options_given = [f"--{name.replace('_', '-')}" for name in options if getattr(self, name)]
+        if options_given:
+            raise ProcessError(f"{' '.join(options_given)}: {self.capture} is {why}.")
 
     def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
         flats = [Path(i["path"]) for i in record.inputs if i["role"] == "flat"]
@@ -177,10 +177,10 @@ def _flat_file(path: Path, capture: Capture) -> Path:
     """The flat capture itself, or the one of a folder that belongs to the capture."""
     if not path.is_dir():
         return path
-    found = nearest_flat(flat_captures(path), capture)
-    if found is None:
+    flat = nearest_flat(flat_captures(path), capture)
+    if flat is None:
         raise ProcessError(
             f"{path} holds no flat field of the camera and wavelength of {capture.path.name}. "
             "Take one (plan key `role: flat`), or leave --flat away."
         )
-    return found
+    return flat

@@ -65,8 +65,8 @@ class Tabulation(FileStep):
         return None if self.white is None else WhiteReference.of(*self.white)
 
     def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
-        made = tabulate(self.sources, self.geometry, self.layout, progress=progress, white=self._scale)
-        made.save(out, (record,))
+        table = tabulate(self.sources, self.geometry, self.layout, progress=progress, white=self._scale)
+        table.save(out, (record,))
 
     def append(self, progress: Progress | None = None) -> Path:
         """Add the sources to the table that is there; without one, make it.
@@ -88,7 +88,7 @@ class Tabulation(FileStep):
 
 
 def _refuse_twice(record: Step, before: Sequence[Step]) -> None:
-    known = {content_of(i) for step in before for i in step.inputs if i["role"] == "source"}
+    sources = {content_of(i) for step in before for i in step.inputs if i["role"] == "source"}
     for source in record.inputs:
-        if source["role"] == "source" and content_of(source) in known:
+        if source["role"] == "source" and content_of(source) in sources:
             raise ProcessError(f"{source['path']} is in the table already; its samples would count twice.")

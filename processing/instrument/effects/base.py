@@ -115,6 +115,6 @@ def retarders(model: InstrumentModel, train: Literal["generator", "analyzer"]) -
 
 def turns(model: InstrumentModel, conditions: Conditions, element: str) -> tuple[Array, ...]:
     """cos and sin of once, then of twice the angle through which the element turned, each (N,)."""
-    found = next(e for e in model.elements() if e.name == element)
-    t = np.deg2rad(found.ratio * conditions.angles_deg[found.axis or ""])
+    part = next(e for e in model.elements() if e.name == element)
+    t = np.deg2rad(part.ratio * conditions.angles_deg[part.axis or ""])
     return np.cos(t), np.sin(t), np.cos(2 * t), np.sin(2 * t)

@@ -24,8 +24,8 @@ def neighbours(mosaic: tuple[tuple[str, ...], ...], channels: Sequence[str]) -> 
     for r in range(rows):
         for c in range(columns):
             for dr, dc in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-                other = mosaic[(r + dr) % rows][(c + dc) % columns]
-                out[names.index(mosaic[r][c]), names.index(other)] += 0.25
+                neighbour = mosaic[(r + dr) % rows][(c + dc) % columns]
+                out[names.index(mosaic[r][c]), names.index(neighbour)] += 0.25
     return out
 
 
