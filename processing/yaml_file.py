@@ -201,16 +201,16 @@ def named_files(path: Path) -> Iterator[tuple[str, Path]]:
     return _named_files(path, (), {Path(os.path.realpath(path))})
 
 
-def _named_files(path: Path, before: tuple[Any, ...], seen: set[Path]) -> Iterator[tuple[str, Path]]:
+def _named_files(path: Path, before: tuple[Any, ...], visited: set[Path]) -> Iterator[tuple[str, Path]]:
     if path.suffix not in (".yaml", ".yml") or not os.path.isfile(path):
         return
     for where, value in _scalars(_tree(path.read_text(encoding="utf-8"), str(path))):
         if not isinstance(value, str) or not os.path.isfile(file := path.parent / value):
             continue
-        if (real := Path(os.path.realpath(file))) not in seen:
-            seen.add(real)
+        if (real := Path(os.path.realpath(file))) not in visited:
+            visited.add(real)
             yield ".".join(str(part) for part in (*before, *where)), file
-            yield from _named_files(file, (*before, *where), seen)
+            yield from _named_files(file, (*before, *where), visited)
 
 
 def dump_yaml(value: BaseModel) -> str:

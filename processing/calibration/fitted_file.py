@@ -80,9 +80,9 @@ def _correlate(tree: Any, fitted: FittedValues, wavelength_nm: float) -> None:
     tree["correlations"] = [*(tree.get("correlations") or []), entry]
 
 
-def _key(known: Any, wavelength_nm: float) -> float:
+def _key(entries: Any, wavelength_nm: float) -> float:
     """The entry that means this wavelength, else the wavelength itself."""
-    return next((k for k in known if abs(float(k) - wavelength_nm) < 0.5), wavelength_nm)
+    return next((k for k in entries if abs(float(k) - wavelength_nm) < 0.5), wavelength_nm)
 
 
 def _node(tree: Any, element: str) -> Any:

@@ -91,7 +91,7 @@ def predict(
         image = view.at(omega, pixels, pixels)
         m0 = model.mueller_jones(image.points, wavelength_nm)
         for name, stokes in states.items():
-            columns[name].append(_summary(predicted(m0, image.points, analyzers, stokes, given=assumed)))
+            columns[name].append(_summary(predicted(m0, image.points, analyzers, stokes, assumptions=assumed)))
         if progress:
             progress(done, len(omega_deg))
     predictions = []
@@ -102,16 +102,16 @@ def predict(
 
 
 def predicted(
-    m0: Array, points: ScatteringGeometry, analyzers: Array, stokes: Array, *, given: Assumptions
+    m0: Array, points: ScatteringGeometry, analyzers: Array, stokes: Array, *, assumptions: Assumptions
 ) -> Xi0Estimate:
     """Estimate from noise-free intensities with the variance that noise would have: its standard errors count."""
     normal, source = points.normal, points.to_source
-    m00 = given.albedo * np.einsum("...i,...i->...", normal, source)
-    m = triply_degenerate.mueller_matrix(m0, given.xi0, m00)
+    m00 = assumptions.albedo * np.einsum("...i,...i->...", normal, source)
+    m = triply_degenerate.mueller_matrix(m0, assumptions.xi0, m00)
     # Analyzer rows hold the factor 1/2 of a polarizer, so unpolarized light gives `electrons` for M00 = 1.
-    w = (2 * given.electrons * analyzers[:, :, None] * stokes).reshape(len(analyzers), 16)
+    w = (2 * assumptions.electrons * analyzers[:, :, None] * stokes).reshape(len(analyzers), 16)
     signal = w @ m.reshape(-1, 16).T
-    return estimate(signal, signal + given.read_noise_e**2, w, m0)
+    return estimate(signal, signal + assumptions.read_noise_e**2, w, m0)
 
 
 def _summary(e: Xi0Estimate) -> tuple[float, float, float, float]:

@@ -148,14 +148,14 @@ def photon_transfer(captures: Sequence[Capture]) -> PhotonTransfer:
     )
 
 
-def _pairs(captures: Sequence[Capture], other: Black) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+def _pairs(captures: Sequence[Capture], default: Black) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
     """Signal and difference of pairs of repeated frames, scaled to single frames; clipped pixels are left out."""
     for capture in captures:
         bits = capture.header.detector.bits
         top = capture.full_scale_counts or (2**bits - 1 if bits else np.inf)
         ceiling = CLIPPING * top if capture.integer_counts else np.inf
         averaged, exposure_s = capture.column("repeats"), capture.column("exposure_s").astype(float)
-        darks = Black.of(capture) or other
+        darks = Black.of(capture) or default
         for group in repeats(capture):
             black = float(darks.at(exposure_s[group[0]]).mean())
             # Each frame serves in one pair, so that pairs are independent.

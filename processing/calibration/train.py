@@ -241,26 +241,26 @@ class _Fit:
             )
         return minimum
 
-    def units(self, found: Any) -> NDArray[np.float64]:
+    def units(self, minimum: Any) -> NDArray[np.float64]:
         """(parts,) rms of the residual over the mean signal at the wavelength of each, noise that the fit took added.
 
         Of a fit in units of the mean signal itself.
         """
         # What each intensity pulls the fit to itself: the diagonal of the projection onto the derivatives.
-        u, singular, _ = np.linalg.svd(found.jac * self.shared.scale[0], full_matrices=False)
+        u, singular, _ = np.linalg.svd(minimum.jac * self.shared.scale[0], full_matrices=False)
         pulled = np.split(np.sum(u[:, singular > UNSEEN * singular[0]] ** 2, axis=1), self._edges)
-        residuals = np.split(found.fun, self._edges)
+        residuals = np.split(minimum.fun, self._edges)
         wavelengths = np.array(_wavelengths(self.parts))
         out = np.empty(len(self.parts))
         for nm in np.unique(wavelengths):
             index = np.flatnonzero(wavelengths == nm).tolist()
             square = sum(float(np.sum(residuals[k] ** 2)) for k in index)
             free = sum(self.parts[k].data.size - self.parts[k].throughputs - float(pulled[k].sum()) for k in index)
-            total = float(np.sum(found.fun**2)) / self.freedom
+            total = float(np.sum(minimum.fun**2)) / self.freedom
             out[index] = max(np.sqrt(square / free if free >= 1 else total), LEAST_RESIDUAL)
         return out
 
-    def covariance(self, found: Any) -> NDArray[np.float64]:
+    def covariance(self, minimum: Any) -> NDArray[np.float64]:
         """(U, U) of what is searched.
 
         Raises
@@ -268,7 +268,7 @@ class _Fit:
         NotDetermined : a combination of parameters is left open.
         """
         step = self.shared.scale[0]
-        jacobian = found.jac * step
+        jacobian = minimum.jac * step
         _, singular, vt = np.linalg.svd(jacobian, full_matrices=False)
         if singular[-1] <= UNSEEN * singular[0]:
             open_ones = dict.fromkeys(self.shared.unknown[k].name for k in np.flatnonzero(np.abs(vt[-1]) > 0.1))
@@ -278,15 +278,15 @@ class _Fit:
                     "known sample (kind mueller), for instance a polarizer."
                 )
             raise NotDetermined(f"the data do not tell apart: {', '.join(open_ones)}. Hold one of them fixed.")
-        variance = 2 * float(found.cost) / self.freedom
+        variance = 2 * float(minimum.cost) / self.freedom
         return np.asarray(np.linalg.inv(jacobian.T @ jacobian) * variance * np.outer(step, step))
 
-    def calibrations(self, found: Any) -> list[Calibration]:
+    def calibrations(self, minimum: Any) -> list[Calibration]:
         """One for each part."""
-        covariance = self.covariance(found)
+        covariance = self.covariance(minimum)
         out = []
         for part, matrix in zip(self.parts, self._matrices, strict=True):
-            fitted = _fitted(self.shared, part.model, matrix, found.x, covariance=covariance)
+            fitted = _fitted(self.shared, part.model, matrix, minimum.x, covariance=covariance)
             residual = part.residual(fitted.model)
             out.append(
                 Calibration(
@@ -332,12 +332,12 @@ def _fitted(
     return FittedValues(shared.names, values, matrix @ covariance @ matrix.T, with_values(model, shared.names, values))
 
 
-def _chance(found: Any, freedom: int, free_fit: Any, separate_freedom: int) -> float | None:
+def _chance(minimum: Any, freedom: int, free_fit: Any, separate_freedom: int) -> float | None:
     """F test of the curves against a value at each wavelength; None where both are the same."""
     held = freedom - separate_freedom
     if held == 0:
         return None
-    worse = (found.cost - free_fit.cost) / held / (free_fit.cost / separate_freedom)
+    worse = (minimum.cost - free_fit.cost) / held / (free_fit.cost / separate_freedom)
     return float(fdtrc(held, separate_freedom, worse))
 
 

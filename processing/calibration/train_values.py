@@ -147,11 +147,11 @@ class TrainValues:
         self,
         wavelengths_nm: Sequence[float],
         nominal: Sequence[NDArray[np.float64]],
-        wanted: Sequence[NDArray[np.float64]],
+        targets: Sequence[NDArray[np.float64]],
     ) -> NDArray[np.float64]:
         """(U,) what is searched, so that the values come nearest to wanted ones (K,) of each part."""
         rows = np.concatenate([self.matrix(w) for w in wavelengths_nm])
-        added = np.concatenate([v - self.base(n) for v, n in zip(wanted, nominal, strict=True)])
+        added = np.concatenate([v - self.base(n) for v, n in zip(targets, nominal, strict=True)])
         return np.asarray(np.linalg.lstsq(rows, added, rcond=None)[0])
 
     def check_range(self, model: InstrumentModel, values: NDArray[np.float64], wavelength_nm: float) -> None:

@@ -15,14 +15,14 @@ from processing.whole_file import write_new_text
 COLUMNS = ("value", "u_noise", "u_systematic", "scatter", "u", "degrees_of_freedom", "k", "low", "high")
 
 
-def write_means(path: Path, found: Sequence[MeanValue], facts: dict[str, Any]) -> None:
+def write_means(path: Path, values: Sequence[MeanValue], facts: dict[str, Any]) -> None:
     """Write means as CSV, or as JSON with the budget of each; what is infinite or not known is null there."""
     if path.suffix == ".json":
-        means = [asdict(v) | {name: getattr(v, name) for name in ("u", "degrees_of_freedom", "k")} for v in found]
+        means = [asdict(v) | {name: getattr(v, name) for name in ("u", "degrees_of_freedom", "k")} for v in values]
         write_new_text(path, json.dumps(_finite({**facts, "means": means}), indent=1) + "\n")
         return
-    columns = {name: np.array([getattr(v, name) for v in found]) for name in ("name", "unit")}
-    columns |= {name: np.array([getattr(v, name) for v in found], dtype=float) for name in COLUMNS}
+    columns = {name: np.array([getattr(v, name) for v in values]) for name in ("name", "unit")}
+    columns |= {name: np.array([getattr(v, name) for v in values], dtype=float) for name in COLUMNS}
     write_csv(path, facts, {}, columns)
 
 

@@ -96,7 +96,7 @@ def _signed_distance(mask: NDArray[np.bool_]) -> Array:
     return np.asarray(gaussian(signed, 1.0))
 
 
-def _rim(mesh: Mesh, camera: PinholeCamera, seen: NDArray[np.bool_]) -> tuple[Array, Array, float]:
+def _rim(mesh: Mesh, camera: PinholeCamera, mask: NDArray[np.bool_]) -> tuple[Array, Array, float]:
     hit, points, normals = mesh.intersect(camera.position_mm, camera.rays(), 0.0)
     if not hit.any():
         raise OutlineNotFound("the mesh is not in the frame at its start pose. Check its scale and translation.")
@@ -104,7 +104,7 @@ def _rim(mesh: Mesh, camera: PinholeCamera, seen: NDArray[np.bool_]) -> tuple[Ar
     index = np.full(hit.shape, -1)
     index[hit] = np.arange(hit.sum())
     chosen = index[rim]
-    return points[chosen], normals[chosen], float((hit & seen).sum() / seen.sum())
+    return points[chosen], normals[chosen], float((hit & mask).sum() / mask.sum())
 
 
 def _sample(image: Array, where: Array) -> Array:

@@ -220,9 +220,9 @@ class InstrumentModel(Section):
         }
         resolved = _resolve(fields, wavelength_nm, self.name)
 
-        def holds(found: dict[str, Any]) -> bool:
+        def holds(effect: dict[str, Any]) -> bool:
             # What was found at one wavelength is not carried over to another, unless it belongs to none.
-            return found["wavelength_nm"] is None or _listed(wavelength_nm, [found["wavelength_nm"]])
+            return effect["wavelength_nm"] is None or _listed(wavelength_nm, [effect["wavelength_nm"]])
 
         resolved["effects"] = [e for e in resolved["effects"] if holds(e)]
         resolved["systematic"] = [
@@ -364,8 +364,8 @@ def _state_count(angles_deg: Mapping[str, ArrayLike], changes: Changes | None) -
     return counts.pop()
 
 
-def _listed(wavelength_nm: float, known: Sequence[float]) -> bool:
-    return any(abs(wavelength_nm - k) < 0.5 for k in known)
+def _listed(wavelength_nm: float, wavelengths: Sequence[float]) -> bool:
+    return any(abs(wavelength_nm - k) < 0.5 for k in wavelengths)
 
 
 def _listing(values: Sequence[float]) -> str:

@@ -43,22 +43,22 @@ class Correlation(Section):
         return np.asarray(out + out.T + np.eye(len(out)))
 
 
-def without_u(node: Any, found: dict[str, Any]) -> Any:
-    """A train as a file has it, without standard uncertainties; those by "element.field" are put into `found`."""
+def without_u(node: Any, errors: dict[str, Any]) -> Any:
+    """A train as a file has it, without standard uncertainties; those by "element.field" are put into `errors`."""
     if isinstance(node, list | tuple):
-        return [without_u(part, found) for part in node]
+        return [without_u(part, errors) for part in node]
     if not isinstance(node, Mapping):
         return node
     plain = {}
     for field, value in node.items():
-        plain[field] = without_u(value, found) if field in TRAINS else value
+        plain[field] = without_u(value, errors) if field in TRAINS else value
         if field in TRAINS or not isinstance(value, Mapping):
             continue
         if set(value) == {"value", "u"}:
-            plain[field], found[f"{node.get('name')}.{field}"] = value["value"], value["u"]
+            plain[field], errors[f"{node.get('name')}.{field}"] = value["value"], value["u"]
             continue
         at = {nm: entry for nm, entry in value.items() if isinstance(entry, Mapping) and set(entry) == {"value", "u"}}
         if at:
             plain[field] = {nm: at[nm]["value"] if nm in at else entry for nm, entry in value.items()}
-            found[f"{node.get('name')}.{field}"] = {nm: entry["u"] for nm, entry in at.items()}
+            errors[f"{node.get('name')}.{field}"] = {nm: entry["u"] for nm, entry in at.items()}
     return plain

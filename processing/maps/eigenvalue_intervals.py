@@ -25,7 +25,7 @@ PURE = (0.15, 0.45)
 OF_NOISE = 2.8
 
 
-def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0, components: float) -> Array:
+def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, estimate: CorrectedXi0, components: float) -> Array:
     """Noise taken off eigenvalues, which it pushes apart, and off what follows from them.
 
     xi0 is that of `process xi0`. The others keep their mean; their gaps say how far noise has pushed them. Returns the
@@ -43,19 +43,19 @@ def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0,
     spread = planes["eigenvalue_deviation_errors"] / (np.sqrt(2 / 3) * unit)
     first, second = -np.diff(xi[1:], axis=0) / unit
     three = of_gaps(first, second, spread, components)
-    mean = (1 - found.xi0) / 3
-    shrunk = np.stack([found.xi0, *(mean + real * deviation)])
-    with_mean, without_mean = three.with_mean(found.stderr / (3 * unit)), three.with_mean(np.zeros_like(unit))
+    mean = (1 - estimate.xi0) / 3
+    shrunk = np.stack([estimate.xi0, *(mean + real * deviation)])
+    with_mean, without_mean = three.with_mean(estimate.stderr / (3 * unit)), three.with_mean(np.zeros_like(unit))
     deviation = deviation + unit * three.middle
     xi = mean + deviation
     low, high = xi - unit * with_mean.below, xi + unit * with_mean.above
     put(
         planes,
         "coherency_eigenvalues",
-        np.stack([found.xi0, *xi]),
-        np.stack([found.stderr, *(unit * with_mean.half)]),
-        np.stack([found.interval_95[0], *low]),
-        np.stack([found.interval_95[1], *high]),
+        np.stack([estimate.xi0, *xi]),
+        np.stack([estimate.stderr, *(unit * with_mean.half)]),
+        np.stack([estimate.interval_95[0], *low]),
+        np.stack([estimate.interval_95[1], *high]),
     )
     put(
         planes,

@@ -89,7 +89,7 @@ def set_magnitudes(
     image: ElementNoise,
     *,
     widened: Array | float = 1.0,
-    known: Mapping[str, VectorNoise] | None = None,
+    noises: Mapping[str, VectorNoise] | None = None,
 ) -> None:
     """Replace value and error of every length of a vector and of every angle, and add their 95 % intervals.
 
@@ -97,7 +97,7 @@ def set_magnitudes(
     ----------
     m : (..., 4, 4), the matrices of which `derived` is.
     widened : (...), factor by which the errors of the dominant process are larger than to first order.
-    known : noise of vectors that is known already, by the name of their length.
+    noises : noise of vectors that is known already, by the name of their length.
     """
     covariance = image.covariance()
     for name, quantity in derived.items():
@@ -110,7 +110,7 @@ def set_magnitudes(
             scale = np.square(quantity.value * m[..., 0, 0]) / np.square(vector).sum(axis=0)
         else:
             vector, scale = quantity.parts.value, np.ones(())
-            noise = (known or {}).get(name) or of_slopes(covariance, vector, quantity.parts.gradient)
+            noise = (noises or {}).get(name) or of_slopes(covariance, vector, quantity.parts.gradient)
         if name.startswith("dominant_"):
             scale = scale * np.square(widened)
         length = np.asarray(quantity.value, dtype=float)

@@ -353,29 +353,29 @@ def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
     return numbers
 
 
-def _value(name: str, one: _Number, own: Sequence[float], inputs: Inputs) -> MeanValue:
-    """Put together the budget of one number; `own` are the values of the single captures."""
-    random, scatter = Contribution("noise of light and camera", one.error), float("nan")
-    if own:
-        off = np.array(own) - one.value
+def _value(name: str, number: _Number, raw: Sequence[float], inputs: Inputs) -> MeanValue:
+    """Put together the budget of one number; `raw` are the values of the single captures."""
+    random, scatter = Contribution("noise of light and camera", number.error), float("nan")
+    if raw:
+        off = np.array(raw) - number.value
         if name in ANGLES or name == "aolp_deg":
             period = 90 if name == EITHER_AXIS else 180
             off -= period * np.round(off / period)
         scatter = float(np.std(off, ddof=1))
-        between = Contribution(f"noise and scatter of {len(own)} captures", scatter / np.sqrt(len(own)), len(own) - 1.0)
+        between = Contribution(f"noise and scatter of {len(raw)} captures", scatter / np.sqrt(len(raw)), len(raw) - 1.0)
         # Few captures say little of their scatter: whichever makes the wider interval.
-        if coverage_factor(between.degrees_of_freedom) * between.u > NORMAL_95 * one.error:
+        if coverage_factor(between.degrees_of_freedom) * between.u > NORMAL_95 * number.error:
             random = between
     budget = [random]
-    for (label, u), moved in zip(inputs, one.moved.tolist(), strict=True):
+    for (label, u), moved in zip(inputs, number.moved.tolist(), strict=True):
         budget.append(Contribution(label, abs(moved), np.inf, u, moved / u))
-    systematic = float(np.sqrt(np.sum(np.square(one.moved))))
-    mean = MeanValue(name, one.unit, one.value, one.error, systematic, scatter, np.nan, np.nan, tuple(budget))
+    systematic = float(np.sqrt(np.sum(np.square(number.moved))))
+    mean = MeanValue(name, number.unit, number.value, number.error, systematic, scatter, np.nan, np.nan, tuple(budget))
     half = mean.k * mean.u
-    low, high = one.value - half, one.value + half
-    if one.ends is not None:
-        more = max(half**2 - (NORMAL_95 * one.error) ** 2, 0.0)
-        low = one.value - float(np.sqrt((one.value - one.ends[0]) ** 2 + more))
-        high = one.value + float(np.sqrt((one.ends[1] - one.value) ** 2 + more))
-        low = max(low, 0.0) if one.ends[0] == 0 else low
+    low, high = number.value - half, number.value + half
+    if number.ends is not None:
+        more = max(half**2 - (NORMAL_95 * number.error) ** 2, 0.0)
+        low = number.value - float(np.sqrt((number.value - number.ends[0]) ** 2 + more))
+        high = number.value + float(np.sqrt((number.ends[1] - number.value) ** 2 + more))
+        low = max(low, 0.0) if number.ends[0] == 0 else low
     return replace(mean, low=low, high=high)

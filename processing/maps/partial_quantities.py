@@ -35,12 +35,12 @@ NEEDED = {
 }
 
 
-def determined_maps(seen: BoolArray, pairs: Pairs) -> list[str]:
-    """Names of the maps that elements `seen` (16,) determine."""
+def determined_maps(is_determined: BoolArray, pairs: Pairs) -> list[str]:
+    """Names of the maps that the determined elements (16,) allow."""
     needed = {name: list(elements) for name, elements in NEEDED.items()}
     for name, (generator, analyzer) in pairs.items():
         needed[name] = np.flatnonzero(np.outer(POLARIZATIONS[analyzer], POLARIZATIONS[generator])).tolist()
-    return [name for name, elements in needed.items() if seen[0] and seen[elements].all()]
+    return [name for name, elements in needed.items() if is_determined[0] and is_determined[elements].all()]
 
 
 def partial_block(

@@ -242,7 +242,7 @@ def quantities_block(
 
 
 def _set_intervals(
-    found: dict[str, NDArray[Any]],
+    planes: dict[str, NDArray[Any]],
     derived: Mapping[str, Derived],
     m: NDArray[np.float64],
     image: MuellerImage | ExtrapolatedImage,
@@ -251,44 +251,44 @@ def _set_intervals(
     retardance: VectorNoise,
 ) -> None:
     """What first order does not give: see `processing.maps.intervals`."""
-    error, linear_error = found["retardance_deg_errors"], found["retardance_linear_deg_errors"]
-    diattenuation_error = found["diattenuation_errors"]
+    error, linear_error = planes["retardance_deg_errors"], planes["retardance_linear_deg_errors"]
+    diattenuation_error = planes["diattenuation_errors"]
     factor: NDArray[np.float64] | float = 1.0
     uneven = 1.0
-    found["td_missed_noise"] = np.zeros_like(found["td_missed"])
-    found["valid"] = np.isfinite(found["td_missed"]).astype(np.uint8)
+    planes["td_missed_noise"] = np.zeros_like(planes["td_missed"])
+    planes["valid"] = np.isfinite(planes["td_missed"]).astype(np.uint8)
     if isinstance(image, MuellerImage):
         noise = coherency_noise(image)
-        found["valid"] &= is_valid(image, noise)
-        xi = np.moveaxis(found["coherency_eigenvalues"], 0, -1).astype(float)
+        planes["valid"] &= is_valid(image, noise)
+        xi = np.moveaxis(planes["coherency_eigenvalues"], 0, -1).astype(float)
         of_depolarizer = image.covariance_of_depolarizer()
         xi0 = corrected(xi, noise, of_depolarizer)
         components = block_components(of_depolarizer)
         uneven = np.sqrt(8 / components)
-        shrunk = set_eigenvalues(found, noise, xi0, components)
-        factor = widen_dominant(found, noise, uneven)
-    set_magnitudes(found, derived, m, image, widened=factor, known={"retardance_deg": retardance})
+        shrunk = set_eigenvalues(planes, noise, xi0, components)
+        factor = widen_dominant(planes, noise, uneven)
+    set_magnitudes(planes, derived, m, image, widened=factor, noises={"retardance_deg": retardance})
     if isinstance(image, MuellerImage):
-        set_any_dominant(found, derived, np.isfinite(factor))
+        set_any_dominant(planes, derived, np.isfinite(factor))
     weakest = np.abs(_symmetric_eigenvalues(np.nan_to_num(depolarizer[..., 1:, 1:]))).min(axis=0)
     # What is left of the light after the diattenuator carries the noise of all of it.
     passed = 1 - np.square(np.asarray(derived["diattenuation"].value) + diattenuation_error)
     least = SEEN * uneven * _relative_error(image)
     is_determined = (passed > 0) & (weakest * passed > least)
-    set_retardance(found, derived, error, linear_error, is_determined=is_determined)
-    set_depolarization_power(found, passed > least)
-    if "differential_retardance_deg" in found:
-        set_differential(found, is_determined & _is_principal(found))
-    if "symmetric_d1" in found:
-        set_symmetric(found, uneven * _relative_error(image))
-    set_ratios(found, derived, image, m[..., 0, 0])
+    set_retardance(planes, derived, error, linear_error, is_determined=is_determined)
+    set_depolarization_power(planes, passed > least)
+    if "differential_retardance_deg" in planes:
+        set_differential(planes, is_determined & _is_principal(planes))
+    if "symmetric_d1" in planes:
+        set_symmetric(planes, uneven * _relative_error(image))
+    set_ratios(planes, derived, image, m[..., 0, 0])
     if isinstance(image, MuellerImage):
-        set_entropy(found, shrunk, derived["coherency_eigenvalues"].gradient, image)
+        set_entropy(planes, shrunk, derived["coherency_eigenvalues"].gradient, image)
 
 
-def _is_principal(found: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+def _is_principal(planes: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
     """Whether the logarithm of M exists, and retardance is more than three errors from where it jumps."""
-    retardance, error = (found[f"differential_retardance_deg{end}"] for end in ("", "_errors"))
+    retardance, error = (planes[f"differential_retardance_deg{end}"] for end in ("", "_errors"))
     return np.asarray(180 - retardance > SEEN * error)
 
 

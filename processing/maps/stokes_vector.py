@@ -51,9 +51,9 @@ def is_stokes_vector(product: Product) -> bool:
     return "stokes" in product.names or is_first_column(seen_elements(product.facts))
 
 
-def is_first_column(seen: BoolArray) -> bool:
-    """Whether the elements `seen` (16,) are of the first column of M, and more than m00."""
-    return bool(seen[0] and seen[4:].any() and not seen.reshape(4, 4)[:, 1:].any())
+def is_first_column(is_determined: BoolArray) -> bool:
+    """Whether the determined elements (16,) are in the first column of M and include more than m00."""
+    return bool(is_determined[0] and is_determined[4:].any() and not is_determined.reshape(4, 4)[:, 1:].any())
 
 
 def light_of(image: MuellerImage, stokes_errors: NDArray[np.float32] | None) -> MuellerImage:
@@ -98,9 +98,9 @@ def light_planes(product: Product) -> dict[str, Plane]:
     return {"stokes": stokes, **dict(names), "stokes_covariance": _COVARIANCE, "lit": _LIT}
 
 
-def light_quantities(seen: BoolArray) -> list[str]:
+def light_quantities(is_determined: BoolArray) -> list[str]:
     """Names that the determined quantities of the light have as quantities of a matrix."""
-    names = [name for name in determined_maps(seen, {}) if name in NAMES]
+    names = [name for name in determined_maps(is_determined, {}) if name in NAMES]
     return [*names, "polarizance_ellipticity_deg"] if "polarizance" in names else names
 
 

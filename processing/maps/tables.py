@@ -137,17 +137,17 @@ def _table_for(product: Product, layout: Layout, white: WhiteReference | None) -
     )
 
 
-def _require_alike(source: Path, own: ScatteringTable, table: ScatteringTable) -> None:
-    if abs(table.wavelength_nm - own.wavelength_nm) > 0.5:
+def _require_alike(source: Path, new: ScatteringTable, table: ScatteringTable) -> None:
+    if abs(table.wavelength_nm - new.wavelength_nm) > 0.5:
         raise ProcessError(
-            f"{source} is at {own.wavelength_nm:g} nm, the table at {table.wavelength_nm:g} nm; "
+            f"{source} is at {new.wavelength_nm:g} nm, the table at {table.wavelength_nm:g} nm; "
             "make one table for each wavelength."
         )
-    if table.quantities != own.quantities:
-        raise ProcessError(f"{source} has {own.quantities[0]}, the table has {table.quantities[0]}. Make one of each.")
-    if table.scale_u != own.scale_u:
+    if table.quantities != new.quantities:
+        raise ProcessError(f"{source} has {new.quantities[0]}, the table has {table.quantities[0]}. Make one of each.")
+    if table.scale_u != new.scale_u:
         raise ProcessError(f"{source}: the table has another absolute scale. Use the same --white for all images.")
-    if (table.has_noise, bool(table.inputs)) != (own.has_noise, bool(own.inputs)):
+    if (table.has_noise, bool(table.inputs)) != (new.has_noise, bool(new.inputs)):
         raise ProcessError(
             f"{source} or the images in the table have no noise, or no uncertainty of their instrument. Reduce all "
             "captures with a file that states it: process reduce --instrument FILE"

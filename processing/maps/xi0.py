@@ -249,7 +249,7 @@ def xi0_of_partial(
 @contextmanager
 def _two_coefficients(
     out: Path,
-    found: Xi0Estimate,
+    result: Xi0Estimate,
     facts: dict[str, Any],
     header: CaptureHeader,
     *,
@@ -261,21 +261,21 @@ def _two_coefficients(
 ) -> Iterator[ProductWriter]:
     """Write an estimate of intensities `fitted` by m0; within the block arrays can be added. Completes the facts."""
     planes: dict[str, NDArray[Any]] = {
-        "xi0": found.xi0,
-        "xi0_errors": found.xi0_stderr,
-        "xi0_68": found.xi0 + np.multiply.outer([-1.0, 1.0], found.xi0_stderr),
-        "xi0_95": found.xi0 + np.multiply.outer([-NORMAL_95, NORMAL_95], found.xi0_stderr),
-        "m00": found.m00,
-        "m00_errors": found.m00_stderr,
-        "condition": found.condition,
-        "unphysical": found.unphysical.astype(np.uint8),
-        "valid": found.valid.astype(np.uint8),
+        "xi0": result.xi0,
+        "xi0_errors": result.xi0_stderr,
+        "xi0_68": result.xi0 + np.multiply.outer([-1.0, 1.0], result.xi0_stderr),
+        "xi0_95": result.xi0 + np.multiply.outer([-NORMAL_95, NORMAL_95], result.xi0_stderr),
+        "m00": result.m00,
+        "m00_errors": result.m00_stderr,
+        "condition": result.condition,
+        "unphysical": result.unphysical.astype(np.uint8),
+        "valid": result.valid.astype(np.uint8),
     }
-    facts["unphysical_pixels"] = int(found.unphysical.sum())
+    facts["unphysical_pixels"] = int(result.unphysical.sum())
     if systematic is not None:
-        set_xi0_systematic(planes, refitted(systematic, fitted, found.xi0, m0))
-        facts |= _systematic_facts(systematic, planes["xi0_systematic"][found.valid])
-    rows, columns = found.xi0.shape
+        set_xi0_systematic(planes, refitted(systematic, fitted, result.xi0, m0))
+        facts |= _systematic_facts(systematic, planes["xi0_systematic"][result.valid])
+    rows, columns = result.xi0.shape
     every = STOKES_PLANES | systematic_planes(systematic)
     with ProductWriter(out, "xi0", header, (rows, columns), planes=every, steps=steps, overwrite=overwrite) as writer:
         yield writer

@@ -158,15 +158,15 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
-def _downloaded(name: str, known: PublicSet, file: SetFile, cache: Path) -> Path:
+def _downloaded(name: str, public_set: PublicSet, file: SetFile, cache: Path) -> Path:
     import logging
 
     import pooch
 
     # A command has a progress bar in place of its lines about every file.
     pooch.get_logger().setLevel(logging.ERROR)
-    raw = known.source.replace("https://github.com", "https://raw.githubusercontent.com")
-    url = f"{raw}/{file.commit or known.commit}/{file.path}"
+    raw = public_set.source.replace("https://github.com", "https://raw.githubusercontent.com")
+    url = f"{raw}/{file.commit or public_set.commit}/{file.path}"
     target = cache / file.local
     try:
         return Path(pooch.retrieve(url, f"sha256:{file.sha256}", target.name, target.parent))

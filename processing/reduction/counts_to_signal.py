@@ -120,20 +120,20 @@ def saturation(capture: Capture) -> float | None:
     return min(top, well - 4 * (detector.read_noise_e or 0.0) / detector.gain_e_per_count)
 
 
-def _check_partner(capture: Capture, other: Capture, role: str) -> None:
-    if other.simulated != capture.simulated:
+def _check_partner(capture: Capture, partner: Capture, role: str) -> None:
+    if partner.simulated != capture.simulated:
         kinds = {True: "simulated", False: "measured"}
         raise CaptureError(
-            f"{other.path} is {kinds[other.simulated]} and {capture.path} is {kinds[capture.simulated]}; "
+            f"{partner.path} is {kinds[partner.simulated]} and {capture.path} is {kinds[capture.simulated]}; "
             "simulated and measured data are never mixed."
         )
-    if (other.channels, other.frame_shape) != (capture.channels, capture.frame_shape):
+    if (partner.channels, partner.frame_shape) != (capture.channels, capture.frame_shape):
         raise CaptureError(
-            f"{other.path} has frames of {other.channels} x {other.frame_shape}, {capture.path} has "
+            f"{partner.path} has frames of {partner.channels} x {partner.frame_shape}, {capture.path} has "
             f"{capture.channels} x {capture.frame_shape}; a {role} capture must be of the same camera and size."
         )
-    if other.states_with(role).size == 0:
-        raise CaptureError(f"{other.path} has no {role} states that are done.")
+    if partner.states_with(role).size == 0:
+        raise CaptureError(f"{partner.path} has no {role} states that are done.")
 
 
 class BlockReader:

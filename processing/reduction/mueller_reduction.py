@@ -166,12 +166,12 @@ class MuellerReduction:
             )
         field = field_of(capture, model, states, changes, level=levels.relative if levels else None)
 
-        def matrix(other: InstrumentModel) -> tuple[Array, Array]:
-            w = source.leveled(measurement_matrix(capture, other, states, capture_changes(capture, other, states)))[0]
+        def matrix(trial: InstrumentModel) -> tuple[Array, Array]:
+            w = source.leveled(measurement_matrix(capture, trial, states, capture_changes(capture, trial, states)))[0]
             return w, w
 
-        def counts_of(other: InstrumentModel) -> CountsCorrection | None:
-            return counts_correction(capture_changes(capture, other, states), other)
+        def counts_of(trial: InstrumentModel) -> CountsCorrection | None:
+            return counts_correction(capture_changes(capture, trial, states), trial)
 
         return cls(
             model=model,
@@ -292,14 +292,14 @@ class MuellerReduction:
         return self.field.matrix(self.field.extra(x, y)[:, 0])
 
 
-def _blank(found: Mapping[str, NDArray[Any]], lost: NDArray[np.bool_], unseen: NDArray[np.bool_]) -> None:
+def _blank(planes: Mapping[str, NDArray[Any]], lost: NDArray[np.bool_], unseen: NDArray[np.bool_]) -> None:
     """Replace by NaN the elements that the instrument cannot see, and every value of lost pixels."""
     if unseen.any():
-        for name in {"mueller", "mueller_errors", "mueller_systematic"} & set(found):
-            found[name][unseen] = np.nan
-        if "mueller_covariance" in found:
-            found["mueller_covariance"][(unseen[:, None] | unseen)[np.tril_indices(ELEMENTS)]] = np.nan
-    for name, values in found.items():
+        for name in {"mueller", "mueller_errors", "mueller_systematic"} & set(planes):
+            planes[name][unseen] = np.nan
+        if "mueller_covariance" in planes:
+            planes["mueller_covariance"][(unseen[:, None] | unseen)[np.tril_indices(ELEMENTS)]] = np.nan
+    for name, values in planes.items():
         if lost.any() and name != "pixel_flags":
             values[..., lost] = np.nan
 

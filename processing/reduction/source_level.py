@@ -62,19 +62,19 @@ class SourceLevels:
         """Numbers fitted for each pixel."""
         return self.fitted / self.pixels
 
-    def add_errors(self, found: dict[str, NDArray[Any]], inversion: Inversion) -> None:
+    def add_errors(self, planes: dict[str, NDArray[Any]], inversion: Inversion) -> None:
         """Add what the errors of the levels, common to all pixels, do to the elements (16, pixels) of each."""
         if not self.directions.size:
             return
         channels = len(inversion.w) // len(self.directions)
-        variance = found["mueller_errors"].astype(float) ** 2
+        variance = planes["mueller_errors"].astype(float) ** 2
         row, column = np.tril_indices(len(variance))
         for step in self.directions.T:
-            moved = (inversion.pinv * np.repeat(step, channels)) @ inversion.w @ found["mueller"]
+            moved = (inversion.pinv * np.repeat(step, channels)) @ inversion.w @ planes["mueller"]
             variance += moved**2
-            if "mueller_covariance" in found:
-                found["mueller_covariance"] += moved[row] * moved[column]
-        found["mueller_errors"] = np.sqrt(variance).astype(np.float32)
+            if "mueller_covariance" in planes:
+                planes["mueller_covariance"] += moved[row] * moved[column]
+        planes["mueller_errors"] = np.sqrt(variance).astype(np.float32)
 
     @property
     def told(self) -> str:
@@ -196,7 +196,7 @@ def _by_state(products: Array, states: int) -> Array:
     return np.asarray(products.reshape(states, channels, states, channels).sum(axis=(1, 3)))
 
 
-def _likeliest_spread(found: Array, variance: Array) -> float:
+def _likeliest_spread(levels: Array, variance: Array) -> float:
     """Standard deviation of levels found (K,), each with an error of its own variance (K,)."""
     total = variance + SPREADS[:, None] ** 2
-    return float(SPREADS[np.argmin(np.sum(np.log(total) + found**2 / total, axis=1))])
+    return float(SPREADS[np.argmin(np.sum(np.log(total) + levels**2 / total, axis=1))])

@@ -232,19 +232,19 @@ def linear_polarization(
 
 
 def _systematic(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> Systematic | None:
-    def rows(other: InstrumentModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        w, analyzers = channel_rows(capture, other, states, capture_changes(capture, other, states))
+    def rows(variant: InstrumentModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        w, analyzers = channel_rows(capture, variant, states, capture_changes(capture, variant, states))
         return w[None], analyzers[None]
 
-    def counts(other: InstrumentModel) -> CountsCorrection | None:
-        return counts_correction(capture_changes(capture, other, states), other)
+    def counts(variant: InstrumentModel) -> CountsCorrection | None:
+        return counts_correction(capture_changes(capture, variant, states), variant)
 
     return Systematic.of(model, rows, counts, np.eye(LINEAR))
 
 
-def systematic_errors(systematic: Systematic, found: dict[str, NDArray[Any]]) -> dict[str, NDArray[np.float32]]:
+def systematic_errors(systematic: Systematic, maps: dict[str, NDArray[Any]]) -> dict[str, NDArray[np.float32]]:
     """Planes `SYSTEMATIC` of an image of s0, s1 and s2."""
-    s = np.stack([found[name] for name in ("s0", "s1", "s2")])
+    s = np.stack([maps[name] for name in ("s0", "s1", "s2")])
     moved = np.stack(list(systematic.moves(s.reshape(LINEAR, -1)))).reshape(-1, *s.shape)
     each = (moved[:, 1], moved[:, 2], *moved_polarization(s, moved))
     return {name: np.sqrt(np.sum(e**2, axis=0), dtype=np.float32) for name, e in zip(SYSTEMATIC, each, strict=True)}
@@ -284,7 +284,7 @@ def _spread(mask: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8
 
 
 def _facts(
-    found: dict[str, NDArray[Any]],
+    maps: dict[str, NDArray[Any]],
     analyzers: NDArray[np.float64],
     noise: NoiseModel | None,
     correction: CountCorrection,
@@ -292,7 +292,7 @@ def _facts(
     method: str,
     states: int,
 ) -> dict[str, Any]:
-    mask, warnings = found["pixel_flags"], list(correction.warnings)
+    mask, warnings = maps["pixel_flags"], list(correction.warnings)
     counts = {flag.name.lower(): int(np.sum((mask & np.uint8(flag)) != 0)) for flag in Mask if flag.name}
     good = (mask & ~np.uint8(Mask.SATURATED)) == 0
     if not good.any():
@@ -306,8 +306,8 @@ def _facts(
     if good[::3, ::3].sum() > 1000:
         some[:] = False
         some[::3, ::3] = good[::3, ::3]
-    lit = some & is_lit(found["s0"], found["s0_errors"])
-    closure = found["closure"][lit] / found["s0"][lit]
+    lit = some & is_lit(maps["s0"], maps["s0_errors"])
+    closure = maps["closure"][lit] / maps["s0"][lit]
     return {
         "states": states,
         "method": method,
@@ -317,10 +317,10 @@ def _facts(
         "noise": noise.source if noise else "estimated from the closure",
         "median_closure_over_s0": float(np.median(closure)) if lit.any() else float("nan"),
         "rms_closure_over_s0": float(np.sqrt(np.mean(closure**2))) if lit.any() else float("nan"),
-        "median_dolp": _median(found["dolp"][lit]),
-        "median_dolp_error": _median(found["dolp_errors"][lit]),
+        "median_dolp": _median(maps["dolp"][lit]),
+        "median_dolp_error": _median(maps["dolp_errors"][lit]),
         "pixels": mask.size,
-        "pixels_with_light": int(np.sum(is_lit(found["s0"], found["s0_errors"]))),
+        "pixels_with_light": int(np.sum(is_lit(maps["s0"], maps["s0_errors"]))),
         "masked": counts,
         "warnings": warnings,
     }

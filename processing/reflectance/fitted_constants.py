@@ -165,7 +165,7 @@ def unexplained(residual: Array, changes: Sequence[Array]) -> float:
 
 
 def result_of(
-    found: Array,
+    constants: Array,
     curvature: Array,
     scores: Array,
     square: float,
@@ -183,7 +183,7 @@ def result_of(
     """
     from scipy.special import chdtrc
 
-    pixels, width, inside = len(scores), of.upper - of.lower, of.inside(found)
+    pixels, width, inside = len(scores), of.upper - of.lower, of.inside(constants)
     size = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
     values = np.linalg.eigvalsh((curvature / np.outer(size, size))[np.ix_(inside, inside)])
     condition = float(np.sqrt(values[-1] / max(values[0], 1e-300))) if inside.any() else np.inf
@@ -203,7 +203,7 @@ def result_of(
     systematic = off.T @ off
     stderr = np.sqrt(np.diag(covariance + departure + systematic))
     # What n does to light is in proportion to n - 1, and so is its error.
-    effect = np.abs(found - np.eye(len(found))[0])
+    effect = np.abs(constants - np.eye(len(constants))[0])
     limit = np.maximum(RELATIVE_LIMIT * effect, of.small)
     # k and a may well be 0. An n at the end of its range is no surface, and errors to first order hold about one n.
     fixed = (stderr <= limit) & inside[0] & (stderr[0] <= limit[0])
@@ -211,7 +211,7 @@ def result_of(
     return MaterialFit(
         kind=of.kind,
         names=of.names,
-        constants=found,
+        constants=constants,
         covariance=covariance,
         departure=departure,
         systematic=systematic,

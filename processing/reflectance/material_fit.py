@@ -221,20 +221,20 @@ class _Correlation:
         return np.asarray(self.data - modelled * np.maximum(overlap, 0) / size)
 
 
-def _fit_correlation(own: _Correlation, moved: Sequence[_Correlation]) -> MaterialFit:
+def _fit_correlation(reference: _Correlation, moved: Sequence[_Correlation]) -> MaterialFit:
     """Fit by linear correlation; `moved` are the same data by an instrument that is off."""
-    constants, jacobian = search(own.residual, DIFFUSE)
+    constants, jacobian = search(reference.residual, DIFFUSE)
     off = np.array([search(variant.residual, DIFFUSE, constants)[0] - constants for variant in moved]).reshape(-1, 4)
-    residual = own.residual(constants)
+    residual = reference.residual(constants)
     changes = [variant.residual(constants) - residual for variant in moved]
-    modelled, overlap = own.parts(constants)
+    modelled, overlap = reference.parts(constants)
     with np.errstate(invalid="ignore", divide="ignore"):
-        rho = overlap[:, 0] / (np.linalg.norm(modelled, axis=1) * np.linalg.norm(own.data, axis=1))
+        rho = overlap[:, 0] / (np.linalg.norm(modelled, axis=1) * np.linalg.norm(reference.data, axis=1))
     slopes = jacobian.reshape(*residual.shape, 4)
     unit = modelled / np.maximum(np.linalg.norm(modelled, axis=1, keepdims=True), 1e-300)
     departures, unlike = [], 0.0
-    for change in _departures(own.model.mueller(constants).reshape(-1, 16)):
-        extra = own.polarized(own.light[:, None] * np.einsum("nki,ni->nk", own.rows, change))
+    for change in _departures(reference.model.mueller(constants).reshape(-1, 16)):
+        extra = reference.polarized(reference.light[:, None] * np.einsum("nki,ni->nk", reference.rows, change))
         extra -= unit * np.sum(unit * extra, axis=1, keepdims=True)
         departures.append(np.einsum("nkp,nk->p", slopes, extra))
         unlike += float(np.sum(extra**2))
@@ -246,7 +246,7 @@ def _fit_correlation(own: _Correlation, moved: Sequence[_Correlation]) -> Materi
     result = result_of(
         constants, curvature, scores, square, free=free, method=method, off=off, departures=apart, of=DIFFUSE
     )
-    share = float(np.sqrt(np.sum(residual**2) / np.sum(own.data**2)))
+    share = float(np.sqrt(np.sum(residual**2) / np.sum(reference.data**2)))
     return replace(result, residual=share, correlation=float(np.nanmean(rho)))
 
 

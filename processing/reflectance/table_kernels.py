@@ -9,19 +9,19 @@ from processing.computing.threads import for_ranges
 
 
 def _claim_rows_at_once(
-    bins: NDArray[np.int32], row_of_bin: NDArray[np.int32], used: int, found: NDArray[np.int32]
+    bins: NDArray[np.int32], row_of_bin: NDArray[np.int32], used: int, new_bins: NDArray[np.int32]
 ) -> int:
-    known = bins >= 0
-    new, first = np.unique(bins[known & (row_of_bin[bins] < 0)], return_index=True)
+    in_range = bins >= 0
+    new, first = np.unique(bins[in_range & (row_of_bin[bins] < 0)], return_index=True)
     new = new[np.argsort(first)]
     row_of_bin[new] = used + np.arange(new.size)
-    found[: new.size] = new
-    bins[known] = row_of_bin[bins[known]]
+    new_bins[: new.size] = new
+    bins[in_range] = row_of_bin[bins[in_range]]
     return new.size
 
 
 @compiled(_claim_rows_at_once)
-def claim_rows(bins, row_of_bin, used, found):  # type: ignore[no-untyped-def]
+def claim_rows(bins, row_of_bin, used, new_bins):  # type: ignore[no-untyped-def]
     # Replaces each bin by its row in the sparse arrays; new bins get the next rows.
     new = 0
     for n in range(bins.size):
@@ -32,7 +32,7 @@ def claim_rows(bins, row_of_bin, used, found):  # type: ignore[no-untyped-def]
         if r < 0:
             r = used + new
             row_of_bin[b] = r
-            found[new] = b
+            new_bins[new] = b
             new += 1
         bins[n] = r
     return new

@@ -33,11 +33,11 @@ class ReportSection:
     notes: Sequence[tuple[str, str]] = ()
 
 
-def render(title: str, simulated: bool, made: str, sections: Sequence[ReportSection]) -> str:
+def render(title: str, simulated: bool, footer: str, sections: Sequence[ReportSection]) -> str:
     """HTML text of a report; every text is escaped by the template."""
     warned = [(number, section, text) for number, section in enumerate(sections) for text in section.warnings]
     return (
         templates()
         .get_template("report.html")
-        .render(title=title, simulated=simulated, made=made, sections=sections, warned=warned, style=style())
+        .render(title=title, simulated=simulated, made=footer, sections=sections, warned=warned, style=style())
     )
