@@ -30,9 +30,9 @@ def extended(model: InstrumentModel, diagnosis: Diagnosis) -> InstrumentModel:
     for name, entry in diagnosis.calibrated.items() if diagnosis.corrects else ():
         element, _, field = name.rpartition(".")
         old = model.value_of(name)
-        values.setdefault(element, {})[field] = _merged(old or 0.0, entry, diagnosis.wavelengths_nm)
+        values.setdefault(element, {})[field] = _merge(old or 0.0, entry, diagnosis.wavelengths_nm)
         error = entry.model_copy(update={"value": entry.stderr or 0.0})
-        errors[name] = _merged(errors.get(name, 0.0), error, diagnosis.wavelengths_nm)
+        errors[name] = _merge(errors.get(name, 0.0), error, diagnosis.wavelengths_nm)
     systematic = diagnosis.systematic()
     wavelengths = [s.wavelength_nm for s in systematic]
     update = {
@@ -43,7 +43,7 @@ def extended(model: InstrumentModel, diagnosis: Diagnosis) -> InstrumentModel:
     return model.with_values(values).model_copy(update=update)
 
 
-def _merged(old: Dispersive, entry: EffectParameter, wavelengths_nm: tuple[float, ...]) -> Dispersive:
+def _merge(old: Dispersive, entry: EffectParameter, wavelengths_nm: tuple[float, ...]) -> Dispersive:
     """A value as the file holds it, with what was fitted in place of what it says at the same wavelengths."""
     if not isinstance(entry.value, tuple):
         if not isinstance(old, dict):

@@ -13,7 +13,7 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.captured.read_capture import read_capture
-from processing.diagnosis.captured.screening import screened
+from processing.diagnosis.captured.screening import screen_capture
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import PRIOR_WIDTH, minimize
@@ -34,7 +34,7 @@ def fit_of_the_truth(
     for path in captures:
         with Capture(path) as capture:
             instrument = model.at(capture.header.wavelength_nm)
-            data.append(screened(read_capture(capture, instrument), instrument, lambda line: None))
+            data.append(screen_capture(read_capture(capture, instrument), instrument, lambda line: None))
     problem = InstrumentProblem(model.at(data[0].wavelength_nm), data)
     numbers = {path.stem: k for k, path in enumerate(captures)}
     keys = {(f.kind, f.place, numbers.get(f.capture) if f.capture else None) for f in faults}

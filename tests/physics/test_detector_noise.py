@@ -5,9 +5,9 @@ import pytest
 from bench_capture import bench_capture
 
 from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.captured.noise import _compared
+from processing.diagnosis.captured.noise import _compare
 from processing.diagnosis.captured.read_capture import read_capture
-from processing.diagnosis.captured.screening import screened
+from processing.diagnosis.captured.screening import screen_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import compute_residual
@@ -34,7 +34,7 @@ def read(path, configs) -> tuple[CaptureData, dict[str, float], float]:
     """The screened capture, the tests of its residual against the model as declared, and chi-square."""
     model = InstrumentModel.load(configs / OPTICS).at(662)
     with Capture(path) as capture:
-        data = screened(read_capture(capture, model), model, lambda line: None)
+        data = screen_capture(read_capture(capture, model), model, lambda line: None)
     problem = InstrumentProblem(model, [data])
     fit = minimize(problem, Space(()), np.zeros(0))
     tests = compute_residual(problem, 0, Space(()), fit).tests
@@ -111,8 +111,8 @@ def test_a_bright_rim_of_few_pixels_is_no_offset_of_columns():
     inside[:16, :6], inside[18:, :6] = False, False
     light = np.where(inside, np.where(np.arange(side) < 6, 5.0, 0.5), np.nan) * np.ones((states, 1, 1))
     r = np.sqrt(light) * random.standard_normal(light.shape)
-    found = _compared(r, light, 0.01 * light, 1.0)
+    found = _compare(r, light, 0.01 * light, 1.0)
     assert found.rows == found.columns == 0
-    found = _compared(r + 0.3 * random.standard_normal((states, 1, side)), light, 0.01 * light, 1.0)
+    found = _compare(r + 0.3 * random.standard_normal((states, 1, side)), light, 0.01 * light, 1.0)
     assert found.columns == pytest.approx(0.09 / 0.5, rel=0.3)
     assert found.rows == 0

@@ -9,7 +9,7 @@ from processing.diagnosis.search.correction import solution
 from processing.diagnosis.search.posterior import fit_posterior
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.data import read_surface
-from processing.diagnosis.surface.diagnose import SurfaceDiagnosis, as_wide_as_the_valley, diagnose_object
+from processing.diagnosis.surface.diagnose import SurfaceDiagnosis, diagnose_object, widen_errors
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
@@ -135,7 +135,7 @@ def test_an_index_where_little_is_polarized_has_an_honest_error(scene, configs, 
     space = Space(tuple(c for c in problem.pool() if c.kind == "refractive_index"))
     found = fit_posterior(problem, space, (), np.zeros(2), say=lambda line: None)
     solved = solution(problem, found, Space(()), np.zeros(0))
-    error = np.sqrt(np.diag(as_wide_as_the_valley(problem, found, solved)[1]))
+    error = np.sqrt(np.diag(widen_errors(problem, found, solved)[1]))
     truth = np.array([fault.parameters["refractive_index"][n] for n in ("n", "k")])
     assert np.all(np.abs(found.values - truth) < 3.5 * error)
     assert error[0] < 0.05

@@ -54,7 +54,7 @@ def test_what_is_found_and_not_used_is_uncertain_as_a_whole():
     own = (np.array([0, 1]), np.eye(2))
     errors = MuellerErrors(space, np.array([1.0, 4.0]), np.diag([0.01, 0.09]), np.zeros((16, 2, 2)), (own,))
     used = Some(space=Space((drift,)), fit=Some(values=np.array([1.0])))
-    assert errors.given(used).tolist() == [1.0, 0.0]
-    change = errors._change(*own[:1], errors.given(used), own[1])
+    assert errors.corrected_values(used).tolist() == [1.0, 0.0]
+    change = errors._change(*own[:1], errors.corrected_values(used), own[1])
     assert change.before == pytest.approx(np.sqrt(17.1))
     assert change.after == pytest.approx(np.sqrt(16.1))

@@ -6,7 +6,7 @@ from bench_capture import bench_capture, read
 
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.whole_bench import WholeBench
-from processing.diagnosis.instrument.wiring import miswired, miswired_train
+from processing.diagnosis.instrument.wiring import find_miswiring, find_train_miswiring
 from processing.instrument.model import InstrumentModel
 from simulators.blind.undeclared_captures import TrueBench
 
@@ -34,7 +34,7 @@ def problem(folder, configs, bench, told, air):
 def test_a_mistake_is_told(configs, tmp_path, told, word, air):
     # Beside small faults of the optics, which are no mistake.
     bench = TrueBench(dg=np.deg2rad(128.0), lp=np.deg2rad(-0.2))
-    found = miswired(problem(tmp_path, configs, bench, told, air))
+    found = find_miswiring(problem(tmp_path, configs, bench, told, air))
     assert found is not None
     assert word in found.message
 
@@ -44,7 +44,7 @@ def test_a_mistake_is_told(configs, tmp_path, told, word, air):
 def test_what_is_no_mistake_is_not_called_one(configs, tmp_path, air, degrees):
     bench = TrueBench(og=np.deg2rad(-17.02 + degrees), dg=np.deg2rad(127.12 + degrees))
     bench.level.append(lambda k, a: 1 + 0.02 * np.sin(k))
-    assert miswired(problem(tmp_path, configs, bench, lambda a: a, air)) is None
+    assert find_miswiring(problem(tmp_path, configs, bench, lambda a: a, air)) is None
 
 
 @pytest.mark.parametrize("degrees", [18.0, 22.0])
@@ -52,7 +52,7 @@ def test_a_plate_that_is_far_off_is_no_other_wavelength(configs, tmp_path, degre
     """Its retardance is nearer to the one at 524 nm: that would leave a third of the residual, the plate nothing."""
     bench = TrueBench(da=np.deg2rad(94.78 + degrees))
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
-    assert miswired(problem(tmp_path, configs, bench, lambda a: a, True), declared) is None
+    assert find_miswiring(problem(tmp_path, configs, bench, lambda a: a, True), declared) is None
 
 
 @pytest.mark.parametrize("air", [True, False])
@@ -60,7 +60,7 @@ def test_the_filter_of_another_wavelength_is_told(configs, tmp_path, air):
     # The plates of this bench have the retardances of 451 nm; the file says 662.
     bench = TrueBench(dg=np.deg2rad(130.01), da=np.deg2rad(143.13))
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
-    found = miswired(problem(tmp_path, configs, bench, lambda a: a, air), declared)
+    found = find_miswiring(problem(tmp_path, configs, bench, lambda a: a, air), declared)
     if not air:
         # Retardances are what an unknown sample absorbs: nothing is told, and nothing wrong.
         assert found is None or "451" in found.message
@@ -79,7 +79,7 @@ def test_a_mistake_is_told_where_the_train_has_nominal_values(configs, tmp_path)
     whole.models = tuple(m.model_copy(update={"calibrate": nominal}) for m in whole.models)
     whole.model = whole.models[0]
     assert WholeBench(whole, lambda line: None).train_is_off
-    found = miswired_train(whole)
+    found = find_train_miswiring(whole)
     assert found is not None
     assert "'psa' turns the other way" in found.message
     straight = problem(tmp_path / "straight", configs, bench, lambda a: a, air=True)

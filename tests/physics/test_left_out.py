@@ -10,7 +10,7 @@ from bench_capture import bench_capture
 from processing.diagnosis.captured import averaged
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
-from processing.diagnosis.captured.screening import screened
+from processing.diagnosis.captured.screening import screen_capture
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.reduction.left_out import Exclusions
 from processing.reduction.mueller import reduce_mueller
@@ -33,7 +33,7 @@ def taken(folder: Path, configs: Path, bench: TrueBench, seed: int, air: bool) -
 def screened_capture(path: Path, configs: Path) -> CaptureData:
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
     with Capture(path) as capture:
-        return screened(read_capture(capture, model), model, lambda line: None)
+        return screen_capture(read_capture(capture, model), model, lambda line: None)
 
 
 def small_faults(bench: TrueBench) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bench_capture import bench_capture, read
 
-from processing.diagnosis.captured.screening import screened
+from processing.diagnosis.captured.screening import screen_capture
 from processing.diagnosis.instrument.diagnose import diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.space import Space
@@ -52,7 +52,7 @@ def test_an_offset_is_no_other_read_noise(configs, tmp_path):
     model, ball = captured(tmp_path / "ball", configs, bench, RoundSample)
     _, air = captured(tmp_path, configs, bench)
     told = []
-    ball, air = (screened(d, model, told.append) for d in (ball, air))
+    ball, air = (screen_capture(d, model, told.append) for d in (ball, air))
     assert any("variance of a pixel" in line for line in told)
     found, sure = said(model, ball, air)
     assert found.noise.verdict == "as_declared"

@@ -182,7 +182,7 @@ def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
             f"{data.name}: its frames have no noise: neighbouring pixels differ by less than numbers are rounded. "
             "`diagnose` weighs each difference by the noise. Give frames of a camera, or add noise to calculated ones."
         )
-    return replace(_compared(r, light, dark, float(np.trace(projector)) / len(projector)), bent=_of_a_bend(white))
+    return replace(_compare(r, light, dark, float(np.trace(projector)) / len(projector)), bent=_of_a_bend(white))
 
 
 def _of_a_bend(white: Whitened) -> float:
@@ -194,7 +194,7 @@ def _of_a_bend(white: Whitened) -> float:
     return float(np.mean(np.maximum(1 + 2 * c * u, 0.0) ** 2))
 
 
-def _compared(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise:
+def _compare(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise:
     expected = light + dark
     far = (NOT_ALIKE_PX, NOT_ALIKE_PX + 1)
     across = {lag: _half_square(r, expected, lag, 2) for lag in (1, *far)}
@@ -290,7 +290,7 @@ def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
     if dim.sum() < FEWEST_PIXELS or not free:
         return None
     level, noise = _dim_levels(y[:, dim], 1 / data.conditions.full_scale)
-    if not _alike_in_halves(y[:, dim], mean[dim], outside, 1 / data.conditions.full_scale):
+    if not _halves_agree(y[:, dim], mean[dim], outside, 1 / data.conditions.full_scale):
         return None
     black, bright = outside.T @ level, outside.T @ y[:, lit].mean(axis=1, dtype=np.float64)
     if not _is_significant(black, noise, free):
@@ -340,7 +340,7 @@ def _courses(data: CaptureData, outside: Array) -> Array:
     return range_of(outside.T @ courses[:, data.row_counts].T)
 
 
-def _alike_in_halves(y: NDArray[np.float32], mean: Array, outside: Array, count: float) -> bool:
+def _halves_agree(y: NDArray[np.float32], mean: Array, outside: Array, count: float) -> bool:
     """Whether the brighter half of dim pixels (L, P) shows the same as the darker one, as an offset does.
 
     What happens to light grows with it, and is another thing on another material.
@@ -446,7 +446,7 @@ def noise_factors(noise: DetectorNoise, shown: float, estimated: bool) -> tuple[
     white = noise.white / shown
     inverse = np.asarray(np.linalg.inv(noise.covariance / shown**2), dtype=float)
     if estimated:
-        return _balanced(noise, white, max(float(factors[1]), SMALL))
+        return _balance(noise, white, max(float(factors[1]), SMALL))
     usual = 1.0, 1.0
     bent = noise.bent
     least = NOISE_OFF if shown == 1 else NOISE_OFF_MIXED
@@ -461,7 +461,7 @@ def noise_factors(noise: DetectorNoise, shown: float, estimated: bool) -> tuple[
     simple = min(gain, read, key=lambda p: _distance(factors, p, inverse))
     if _distance(factors, simple, inverse) < SHOWN**2:
         return float(simple[0]), float(simple[1])
-    return _balanced(noise, white, max(float(factors[1]), SMALL))
+    return _balance(noise, white, max(float(factors[1]), SMALL))
 
 
 def _distance(factors: Array, expected: tuple[float, float], inverse: Array) -> float:
@@ -475,7 +475,7 @@ def _dark_is_off(noise: DetectorNoise, shown: float) -> bool:
     )
 
 
-def _balanced(noise: DetectorNoise, white: float, dark: float) -> tuple[float, float]:
+def _balance(noise: DetectorNoise, white: float, dark: float) -> tuple[float, float]:
     """Both factors with the whole as found, which is known best."""
     light = noise.light_share
     shot = (white - dark * (1 - light)) / light if light > SMALL else 1.0

@@ -148,7 +148,7 @@ def bad_frames(data: CaptureData, a: Array) -> tuple[BadFrame, ...]:
             break
         bad.append(before)
         state_indices, before = subset, after
-    return tuple(bad) or moments.exchanged(state_indices)
+    return tuple(bad) or moments.find_exchange(state_indices)
 
 
 class _Moments:
@@ -192,7 +192,7 @@ class _Moments:
                 worst = BadFrame(state, misfit)
         return worst
 
-    def exchanged(self, states: Sequence[int]) -> tuple[BadFrame, ...]:
+    def find_exchange(self, states: Sequence[int]) -> tuple[BadFrame, ...]:
         """The two of which each fits in the other's place, and most of what is left over goes; or none."""
         p, beyond = self._fitted(states)
         least, pair = (1 - MOSTLY) * self.excess(states), None
@@ -299,7 +299,7 @@ def _noisier_than_around(noisy: Array, free: int) -> NDArray[np.bool_]:
     return np.asarray(noisy > least * np.maximum(around, np.median(noisy)))
 
 
-def without(data: CaptureData, outliers: Outliers) -> CaptureData:
+def remove_outliers(data: CaptureData, outliers: Outliers) -> CaptureData:
     """The capture with the pixels of outliers left out, and their counts filled in from the pixels around.
 
     A pixel is left out whole, since the moments need all its states; what is filled in serves image derivatives.

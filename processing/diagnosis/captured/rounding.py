@@ -98,11 +98,11 @@ class Rounding:
     def of_frame(self, k: int, frame: NDArray[np.float32]) -> tuple[Array, Array, Array]:
         """Shift, variance and variance ratio, (channels,) each, of the stored frame of state k above black."""
         black = np.tensordot(self._black.weights(self._exposure_s[k])[0], self.of_black, axes=1)
-        _, shift, variance, ratio = self._of(_some(self._planes(frame)), black[0], self._repeats[k])
+        _, shift, variance, ratio = self._of(_subsample(self._planes(frame)), black[0], self._repeats[k])
         return shift - black[1], variance + black[2], ratio
 
     def _of_darks(self, capture: Capture, states: NDArray[np.int64]) -> Array:
-        frames = [_some(self._planes(capture.frames(int(k)).astype(np.float32))) for k in states]
+        frames = [_subsample(self._planes(capture.frames(int(k)).astype(np.float32))) for k in states]
         return self._of(np.concatenate(frames, axis=1), np.inf, self._repeats[states].mean(), image=False)
 
     def _of(self, counts: NDArray[np.float32], black: Array | float, repeats: float, *, image: bool = True) -> Array:
@@ -116,7 +116,7 @@ class Rounding:
         return np.stack([mean, *np.transpose(each)])
 
 
-def _some(planes: NDArray[np.float32]) -> NDArray[np.float32]:
+def _subsample(planes: NDArray[np.float32]) -> NDArray[np.float32]:
     """Counts (channels, pixels) of frames (channels, rows, columns), of a large one every so many pixels."""
     counts = planes.reshape(len(planes), -1)
     return counts[:, :: counts.shape[1] // PIXELS + 1]

@@ -18,7 +18,7 @@ from processing.computing.filters import separable
 from processing.diagnosis.captured.averaged import averaged_for_fits
 from processing.diagnosis.captured.capture_data import CaptureData, LeftOut
 from processing.diagnosis.captured.noise import checked_noise, estimated_noise
-from processing.diagnosis.captured.outliers import bad_frames, outliers_of, without
+from processing.diagnosis.captured.outliers import bad_frames, outliers_of, remove_outliers
 from processing.diagnosis.captured.read_capture import without_dark_pixels
 from processing.instrument.applied_effects import changes_of
 from processing.instrument.model import InstrumentModel
@@ -74,7 +74,7 @@ def _round_trip(shift_px: float) -> Array:
     return np.asarray(near / near.sum())
 
 
-def screened(data: CaptureData, model: InstrumentModel, say: Callable[[str], None]) -> CaptureData:
+def screen_capture(data: CaptureData, model: InstrumentModel, say: Callable[[str], None]) -> CaptureData:
     """The capture without hits, bad pixels, bad frames and sharp edges, and with the noise that it shows.
 
     `model` is resolved at its wavelength.
@@ -83,7 +83,7 @@ def screened(data: CaptureData, model: InstrumentModel, say: Callable[[str], Non
     outliers = outliers_of(data, a)
     hits, bad = np.argwhere(outliers.hits), np.argwhere(outliers.bad)
     if len(hits) or len(bad):
-        data = without(data, outliers)
+        data = remove_outliers(data, outliers)
         # What was struck is no noise either.
         data = estimated_noise(data) if data.noise_estimated else data
         data = replace(data, left_out=LeftOut(hits=hits, pixels=bad, pitch=data.pitch))
@@ -99,10 +99,10 @@ def screened(data: CaptureData, model: InstrumentModel, say: Callable[[str], Non
     data = checked_noise(without_steep_pixels(data) if data.noise_known else data, a)
     for line in data.told_of_noise:
         say(f"the noise of {data.name} is not what is declared: {line}")
-    return _as_fitted(data, say)
+    return _average_for_fit(data, say)
 
 
-def _as_fitted(data: CaptureData, say: Callable[[str], None]) -> CaptureData:
+def _average_for_fit(data: CaptureData, say: Callable[[str], None]) -> CaptureData:
     """The capture, or means over squares of its pixels, without those that are dark or at sharp edges."""
     # Edges are left out of the fits, not of the means.
     with_edges = data if data.steep is None else replace(data, usable=data.usable | data.steep)

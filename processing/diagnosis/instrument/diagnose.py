@@ -11,7 +11,7 @@ import numpy as np
 from processing.computing.blas import one_blas_thread
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
-from processing.diagnosis.captured.screening import screened
+from processing.diagnosis.captured.screening import screen_capture
 from processing.diagnosis.instrument.answer import calibrated, capture_report, missing, noise_report, not_measured
 from processing.diagnosis.instrument.doubts import doubts, testable
 from processing.diagnosis.instrument.mueller_error import MuellerErrors, chances, lasts
@@ -19,8 +19,8 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
 from processing.diagnosis.instrument.structure import Residual, compute_residual, descriptions
 from processing.diagnosis.instrument.whole_bench import WholeBench, validation_problem
-from processing.diagnosis.instrument.wiring import Wiring, miswired, miswired_train
-from processing.diagnosis.search.causes import causes, would_be_seen
+from processing.diagnosis.instrument.wiring import Wiring, find_miswiring, find_train_miswiring
+from processing.diagnosis.search.causes import causes, observable_effects
 from processing.diagnosis.search.correction import solution
 from processing.diagnosis.search.decision import Judgement, beyond_chance
 from processing.diagnosis.search.fit import Solution
@@ -127,7 +127,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
 
 def _rewire(problem: InstrumentProblem, say: Say, declared: InstrumentModel | None) -> tuple[Wiring | None, WholeBench]:
     """The bench without a mistake of wiring, and which one that was."""
-    wiring = miswired(problem, declared)
+    wiring = find_miswiring(problem, declared)
     if wiring is not None:
         say(wiring.message)
         problem = wiring.problem
@@ -135,7 +135,7 @@ def _rewire(problem: InstrumentProblem, say: Say, declared: InstrumentModel | No
     if not bench.train_is_off:
         return wiring, bench
     say("no values of the train fit: looking for a mistake of wiring")
-    wiring = miswired_train(problem, declared)
+    wiring = find_train_miswiring(problem, declared)
     if wiring is None:
         return None, bench
     say(wiring.message)
@@ -152,7 +152,7 @@ def _judge(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring:
         named=bool(names.named or switched or posterior.any_cause),
         sure=bool(names.sure or switched),
         structure=used.structure or bool(names.untold),
-        observable=bool(would_be_seen(posterior)),
+        observable=bool(observable_effects(posterior)),
         figures=checks(validation, solved),
         # Where there is nothing to apply, nothing is said of what it would do.
         chances=chances(now, later, lasting, each) if solved.effects else (),
@@ -222,6 +222,6 @@ def diagnose_captures(
         say(f"reading {path.name}")
         with Capture(path) as capture:
             models.append(model.nominal_at(capture.header.wavelength_nm))
-            data.append(screened(read_capture(capture, models[-1]), models[-1], say))
+            data.append(screen_capture(read_capture(capture, models[-1]), models[-1], say))
     judged = diagnose(InstrumentProblem(models, data), say, model)
     return judged, judged.problem

@@ -37,7 +37,7 @@ def doubts(
     static = _static_shifts(problem, solved, causes)
     even = Evenness(problem, solved.space, solved.fit.values)
     for cause in causes:
-        reason = STANDS if cause in static else _of_itself(problem, solved, cause, causes=causes, even=even)
+        reason = STANDS if cause in static else _doubt_of(problem, solved, cause, causes=causes, even=even)
         if reason is not None:
             out[cause] = reason
     # What is something else took away a part of what is left over.
@@ -46,7 +46,7 @@ def doubts(
     return with_parts(posterior, causes, out, chi2=chi2, noise_known=problem.noise_known)
 
 
-def _of_itself(
+def _doubt_of(
     problem: InstrumentProblem,
     solved: Solution,
     cause: Cause,

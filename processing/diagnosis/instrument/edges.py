@@ -79,7 +79,7 @@ def _of_capture(
     if edge.sum() < FEWEST_AT_EDGES:
         return None
     acting = [[c for c in group if c.acts(k, data.wavelength_nm)] for group in shifts]
-    without = _without(space, values, [c for group in acting for c in group])
+    without = _values_without(space, values, [c for group in acting for c in group])
     changes = problem.changes(k, space, without)
     rest_px = changes.shift_px / data.pitch
     rows, sigma, use = data.values_per_pixel, moments.sigma.astype(np.float32)[:, None, None], moments.counts
@@ -95,7 +95,7 @@ def _of_capture(
     for s, group in enumerate(acting):
         if not group:
             continue
-        own_values = _without(space, values, [c for each in acting if each is not group for c in each])
+        own_values = _values_without(space, values, [c for each in acting if each is not group for c in each])
         own_px = problem.changes(k, space, own_values).shift_px / data.pitch - rest_px
         frames = (fitted * sigma).reshape(data.signal.shape)
         moved = replace(data, signal=frames, true_variance=None).moved_back(-own_px).signal
@@ -105,7 +105,7 @@ def _of_capture(
     return out, ((images - fitted)[:, edge] / scale)[use].reshape(-1), noise
 
 
-def _without(space: Space, values: Array, candidates: Sequence[Candidate]) -> Array:
+def _values_without(space: Space, values: Array, candidates: Sequence[Candidate]) -> Array:
     """The values with those of some candidates at zero."""
     out = values.copy()
     for candidate, part in space.pairs:

@@ -69,7 +69,7 @@ def nearest_branch(problem: InstrumentProblem, estimates: Mapping[Candidate, Arr
     branches: list[tuple[tuple[str, ...], Values]] = [((), values)]
     for count in range(1, len(places) + 1):
         for turned in combinations(places, count):
-            mirrored = _quarter_turned(problem, values, turned)
+            mirrored = _turn_quarter(problem, values, turned)
             if _excess(problem, mirrored) <= excess * (1 + ALIKE):
                 branches.append((turned, mirrored))
     branches.sort(key=lambda branch: _distance(branch[1], places))
@@ -102,7 +102,7 @@ def _of_nominal_retardance(problem: InstrumentProblem, estimates: Mapping[Candid
         # A half-wave plate has both at one distance: then the smaller retardance is taken, and the azimuth decides.
         turns = nearer > TIE or (nearer > -TIE and opposite < same)
         if turns and azimuth is not None and azimuth.wavelength_nm == candidate.wavelength_nm:
-            values[azimuth] = _turned(azimuth, values[azimuth], QUARTER_TURN)
+            values[azimuth] = _turn(azimuth, values[azimuth], QUARTER_TURN)
             same = opposite
         values[candidate] = np.array([same])
     return values
@@ -124,23 +124,23 @@ def _mean(candidate: Candidate, values: Array) -> float:
 
 
 def _within_half_a_turn(candidate: Candidate, values: Array) -> Array:
-    return _turned(candidate, values, -HALF_TURN * float(np.round(_mean(candidate, values) / HALF_TURN)))
+    return _turn(candidate, values, -HALF_TURN * float(np.round(_mean(candidate, values) / HALF_TURN)))
 
 
-def _turned(candidate: Candidate, values: Array, by_deg: float) -> Array:
+def _turn(candidate: Candidate, values: Array, by_deg: float) -> Array:
     if candidate.curve is None or not by_deg:
         return values + by_deg
     return values + candidate.curve.through(np.full((len(candidate.curve.wavelengths_nm), 1), by_deg))
 
 
-def _quarter_turned(problem: InstrumentProblem, values: Values, places: tuple[str, ...]) -> Values:
+def _turn_quarter(problem: InstrumentProblem, values: Values, places: tuple[str, ...]) -> Values:
     """The values with the azimuths of some places turned, each to its nearer side, and diattenuations reversed."""
     out = dict(values)
     reversed_too = {f"{place.rpartition('.')[0]}.diattenuation" for place in places}
     for candidate, value in values.items():
         if candidate.place in places:
             by = -QUARTER_TURN if _mean(candidate, value) > 0 else QUARTER_TURN
-            out[candidate] = _turned(candidate, value, by)
+            out[candidate] = _turn(candidate, value, by)
         elif candidate.place in reversed_too and candidate.curve is None:
             out[candidate] = -value - 2 * number(problem.model.value_of(candidate.place) or 0.0)
     return out
@@ -171,14 +171,14 @@ def first_values(problem: InstrumentProblem, base: Space, pool: Sequence[Candida
         return base.split(fit.values)
     say("far off: searching from many starts")
     if not several:
-        return _searched(problem, base, pool, fit)
+        return _search(problem, base, pool, fit)
     estimates = along_wavelengths(problem, base, say)
     space = Space(tuple(estimates))
     sums = problem.sums(space, space.vector(estimates), derivatives=False)
     return estimates if sums.excess.sum() < fit.excess else base.split(fit.values)
 
 
-def _searched(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate], fit: Fit) -> Values:
+def _search(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate], fit: Fit) -> Values:
     # Nominal values are not found beside a source or channels that are as far off.
     free = [c for c in pool if c.effect.of_channels or (c.effect.of_source and c.effect.per_state)]
     wide = Space((*base.candidates, *free))
@@ -246,12 +246,12 @@ def along_wavelengths(problem: InstrumentProblem, base: Space, say: Say) -> Valu
     each = [_AtOne(problem.at(w), space, w) for w in wavelengths]
     best: Fit | None = None
     for first in (len(wavelengths) // 2, 0, len(wavelengths) - 1):
-        solutions: dict[int, Values] = {first: each[first].searched()}
+        solutions: dict[int, Values] = {first: each[first].search_starts()}
         for k in range(first + 1, len(wavelengths)):
             solutions[k] = each[k].beside(_pointed_to(solutions, each, k, (k - 1, k - 2)))
         for k in reversed(range(first)):
             solutions[k] = each[k].beside(_pointed_to(solutions, each, k, (k + 1, k + 2)))
-        fit = minimize(problem, space, _joined(space, [solutions[k] for k in range(len(wavelengths))]))
+        fit = minimize(problem, space, _join(space, [solutions[k] for k in range(len(wavelengths))]))
         say(f"beginning at {wavelengths[first]:g} nm: {100 * fit.rms:.3g} %")
         if best is None or fit.excess < best.excess:
             best = fit
@@ -273,7 +273,7 @@ class _AtOne:
         large = (_anywhere(c) or not c.effect.is_nominal for c in candidates for _ in c.parameters)
         self._large = np.array(list(large))
 
-    def searched(self) -> Values:
+    def search_starts(self) -> Values:
         """From many starts, where it is far off."""
         fit = minimize(self.problem, self.space, np.zeros(self.space.size), free=self._large)
         values = fit.values
@@ -304,7 +304,7 @@ def _pointed_to(
     return {place: v + share * (v - far[place]) for place, v in near.items()}
 
 
-def _joined(space: Space, solutions: Sequence[Values]) -> Array:
+def _join(space: Space, solutions: Sequence[Values]) -> Array:
     """Values of the common vector, of those at each wavelength in ascending order."""
     parts = []
     for candidate in space.candidates:

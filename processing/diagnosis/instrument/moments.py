@@ -187,13 +187,13 @@ class _Grid:
     def of(cls, height: int, width: int) -> _Grid:
         small = min(height, width)
         side = min(MOST_TILES, max(small // TILE_PX, TILES), small)
-        r, rows, y = _divided(height, side)
-        c, columns, x = _divided(width, side)
+        r, rows, y = _divide(height, side)
+        c, columns, x = _divide(width, side)
         boxes = tuple((down, across) for down in rows for across in columns)
         return cls(r[:, None] * side + c, boxes, np.tile(x, side), np.repeat(y, side))
 
 
-def _divided(size: int, parts: int) -> tuple[NDArray[np.int64], list[slice], Array]:
+def _divide(size: int, parts: int) -> tuple[NDArray[np.int64], list[slice], Array]:
     """Which part each pixel of a side is in, the pixels of each part, and their mean place from -1 to 1."""
     number = (np.arange(size) * parts) // size
     ends = np.searchsorted(number, np.arange(parts + 1))

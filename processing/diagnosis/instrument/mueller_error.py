@@ -56,7 +56,7 @@ def mueller_slopes(
         changes = problem.changes(k, mine, local)
         columns = partial(_all_columns, problem, k)
         w, c = columns(changes), problem.coefficients(k, changes)
-        u, size, vt = _decomposed(w * moments.counts[:, None])
+        u, size, vt = _decompose(w * moments.counts[:, None])
         dw, dc = problem.slopes(k, mine, local, w, columns=columns), problem.slopes_of_counts(k, mine, local, c)
         scale = 1 / moments.sigma[:, None]
         for block in moments.blocks[:: problem.folds if moments.tiles is None else 1]:
@@ -68,7 +68,7 @@ def mueller_slopes(
             m = back @ y
             if problem.has_free_level(k):
                 # A reduction projects the level of each state out: a common factor of its channels moves no element.
-                u1, size1, vt1 = _decomposed(_without_levels(w * moments.counts[:, None], m, problem.channels(k)))
+                u1, size1, vt1 = _decompose(_without_levels(w * moments.counts[:, None], m, problem.channels(k)))
                 back = (vt1.T * (size1 / (size1**2 + unknown))) @ u1.T
             slopes = -np.einsum("el,klm,mr->ker", back, dw, m, optimize=True)
             for j in np.flatnonzero(np.any(dc, axis=(1, 2))):
@@ -81,7 +81,7 @@ def mueller_slopes(
         yield acting.index, products / (max(light, 1e-300) * ELEMENTS)
 
 
-def _decomposed(w: Array) -> tuple[Array, Array, Array]:
+def _decompose(w: Array) -> tuple[Array, Array, Array]:
     """Singular value decomposition of rows (L, 16), of what they determine."""
     u, size, vt = np.linalg.svd(w, full_matrices=False)
     keep = size > RANK * size[0]
@@ -134,13 +134,13 @@ class MuellerErrors:
             each.append((acting, part.sum(axis=0)))
         return cls(space, values, posterior.covariance[np.ix_(index, index)], products, tuple(each))
 
-    def given(self, used: Solution) -> Array:
+    def corrected_values(self, used: Solution) -> Array:
         """Values (K,) that a correction applies."""
         return self.space.vector(used.space.split(used.fit.values))
 
     def changes(self, used: Solution) -> tuple[PredictedChange, PredictedChange, tuple[PredictedChange, ...]]:
         """What a correction does to M of these captures, of later ones, and of each of these."""
-        correction, lasts = self.given(used), np.flatnonzero(self._of("instrument"))
+        correction, lasts = self.corrected_values(used), np.flatnonzero(self._of("instrument"))
         products = self.products.sum(axis=0)
         return (
             self._change(np.arange(correction.size), correction, products),
@@ -159,7 +159,7 @@ class MuellerErrors:
 
         None where nothing does.
         """
-        missed = self.values - self.given(used)
+        missed = self.values - self.corrected_values(used)
         covariance = self.covariance + np.outer(missed, missed)
         of_elements = np.sum(covariance * self.products, axis=(1, 2)) * ELEMENTS
         # That of M/m00 is one, whatever m00 is.
@@ -176,7 +176,7 @@ class MuellerErrors:
         rms = float(np.sqrt(of_elements.sum() / ELEMENTS))
         stored = SystematicError(
             directions=tuple(
-                _as_effects(self.space, d, slopes * np.abs(d), names) for d in directions.T[: min(enough, MOST_STORED)]
+                _effects_of(self.space, d, slopes * np.abs(d), names) for d in directions.T[: min(enough, MOST_STORED)]
             ),
             rms_over_m00=rms,
             wavelength_nm=None if several else problem.wavelengths_nm[0],
@@ -222,7 +222,7 @@ def _moves_m(posterior: Posterior, k: int, applied: bool) -> bool:
     return bool(posterior.samples.probability[group] > TAKES_PART)
 
 
-def _as_effects(space: Space, direction: Array, size: Array, names: tuple[str, ...]) -> tuple[AppliedEffect, ...]:
+def _effects_of(space: Space, direction: Array, size: Array, names: tuple[str, ...]) -> tuple[AppliedEffect, ...]:
     effects = []
     for candidate, part in space.pairs:
         if size[part].max() <= SMALL_PART * size.max():

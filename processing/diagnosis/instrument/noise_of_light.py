@@ -38,7 +38,7 @@ def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new
     for k, (data, still) in enumerate(zip(near.captures, problem.still, strict=True)):
         if still.noise_estimated or still.told_of_noise:
             continue
-        residual, free = _rest(near, k, space, local)
+        residual, free = _residual(near, k, space, local)
         if undone_here:
             # What is undone stretches the residual with the counts; their noise is that of counts as they were stored.
             _, slope = undoing(still, undone_here)(still.signal.astype(float))
@@ -77,7 +77,7 @@ def _log_scatter(
     return float(sums.sum())
 
 
-def _rest(problem: InstrumentProblem, k: int, space: Space, values: Array) -> tuple[NDArray[np.float32], Array]:
+def _residual(problem: InstrumentProblem, k: int, space: Space, values: Array) -> tuple[NDArray[np.float32], Array]:
     """Residual (L, rows, columns) of a capture in counts over full scale, and the share (L,) of noise in it."""
     data, level = problem.captures[k], problem.moments[k].sigma
     changes = problem.changes(k, space, values)

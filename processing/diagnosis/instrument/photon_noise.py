@@ -70,20 +70,20 @@ def with_noise_of_light(data: CaptureData, a: Array, bends: Mapping[Candidate, A
     """
     shared = data.shared.shown < 1 or data.shared.rows > 0 or data.shared.columns > 0
     if not data.noise_known or data.noise_estimated or shared:
-        return _of_light(data, bends)
+        return _use_light_noise(data, bends)
     least, usual = max(abs(data.noise_level[0] - 1), GAIN_OFF), (1.0, 1.0)
     # An offset looks like another read-out noise, and the reverse.
-    data = _scaled(data, usual if bends else data.noise_factors, usual)
-    noise = _shown(data, a, bends)
+    data = _scale_noise(data, usual if bends else data.noise_factors, usual)
+    noise = _detector_noise(data, a, bends)
     if noise is None:
-        return _of_light(data, bends)
+        return _use_light_noise(data, bends)
     factors = noise_factors(noise, 1.0, estimated=False) if bends else data.noise_factors
     if bends and factors == usual and abs(noise.white - 1) > least + SHOWN * noise.white_error:
         return None
     if factors != data.noise_factors:
-        data = _scaled(data, factors, usual)
-        noise = _shown(data, a, bends) or noise
-    return _of_light(_scaled(data, factors, _level(noise)), bends)
+        data = _scale_noise(data, factors, usual)
+        noise = _detector_noise(data, a, bends) or noise
+    return _use_light_noise(_scale_noise(data, factors, _level(noise)), bends)
 
 
 def _level(noise: DetectorNoise) -> tuple[float, float]:
@@ -97,20 +97,20 @@ def _level(noise: DetectorNoise) -> tuple[float, float]:
     return float(np.clip(1 + deviation[0], 1 - NOISE_OFF, 1 + NOISE_OFF)), float(max(1 + deviation[1], LEAST_PART))
 
 
-def _scaled(data: CaptureData, factors: tuple[float, float], level: tuple[float, float]) -> CaptureData:
+def _scale_noise(data: CaptureData, factors: tuple[float, float], level: tuple[float, float]) -> CaptureData:
     """The capture with another noise than is stated, by factors on its parts with and without light."""
     old = np.multiply(data.noise_factors, data.noise_level)
     slope, floor = np.multiply(factors, level) / old
     return replace(data, slope=data.slope * slope, floor=data.floor * floor, noise_factors=factors, noise_level=level)
 
 
-def _of_light(data: CaptureData, bends: Mapping[Candidate, Array]) -> CaptureData:
+def _use_light_noise(data: CaptureData, bends: Mapping[Candidate, Array]) -> CaptureData:
     return data.with_noise_of(undoing(data, bends)) if bends else replace(data, true_variance=None)
 
 
-def _shown(data: CaptureData, a: Array, bends: Mapping[Candidate, Array]) -> DetectorNoise | None:
+def _detector_noise(data: CaptureData, a: Array, bends: Mapping[Candidate, Array]) -> DetectorNoise | None:
     if data.wide is not None:
         # Differences of pixels show nothing of what is common to all of them.
         data = replace(data, slope=data.slope / data.wide, floor=data.floor / data.wide)
-    corrected = _of_light(data, bends)
+    corrected = _use_light_noise(data, bends)
     return detector_noise(corrected.undone(undoing(data, bends)) if bends else corrected, a)

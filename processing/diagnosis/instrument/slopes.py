@@ -62,7 +62,7 @@ def slopes_of_rows(
                 by_axis[axis] = (columns(turned) - a) / STEP
             da[part.start, ..., first * channels :, :] = by_axis[axis][..., first * channels :, :]
             continue
-        for j, (moved, step_j) in enumerate(stepped(candidate, part, values)):
+        for j, (moved, step_j) in enumerate(step_values(candidate, part, values)):
             da[part.start + j] = (columns(changes_of(moved)) - a) / step_j
     return da
 
@@ -74,7 +74,7 @@ def slopes_of_counts(
     dc = np.zeros((space.size, *c.shape))
     for candidate, part in fitted(space):
         if candidate.acts_on_counts:
-            for j, (moved, step) in enumerate(stepped(candidate, part, values)):
+            for j, (moved, step) in enumerate(step_values(candidate, part, values)):
                 dc[part.start + j] = (coefficients(changes_of(moved)) - c) / step
     return dc
 
@@ -85,7 +85,7 @@ def fitted(space: Space) -> list[tuple[Candidate, slice]]:
     return [(c, part) for c, part in pairs if not c.effect.is_switch]
 
 
-def stepped(candidate: Candidate, part: slice, values: Array) -> Iterator[tuple[Array, float]]:
+def step_values(candidate: Candidate, part: slice, values: Array) -> Iterator[tuple[Array, float]]:
     """All values with one of a candidate's after the other moved by a small step, and the step."""
     for j, step in enumerate(STEP * candidate.typical):
         moved = values.copy()

@@ -104,7 +104,7 @@ def compute_residual(problem: InstrumentProblem, capture: int, space: Space, fit
     r[:, ~used] = np.nan
     # Of a row that does not count nothing is left, and no noise is expected.
     r[~moments.counts], free[~moments.counts] = np.where(used, 0.0, np.nan), 0.0
-    around = _around(signal)
+    around = _average_corners(signal)
     signal[:, ~used], free[:, ~used] = 0.0, 0.0
     expected = free
     per_scale = np.where(used, 1 / np.where(used, pixels.scale, 1.0), 0.0)
@@ -112,7 +112,7 @@ def compute_residual(problem: InstrumentProblem, capture: int, space: Space, fit
         of_row *= pixels.variance_of(row) / level[row] ** 2 * per_scale
     good = np.asarray(np.isfinite(r).all(axis=0))
     images = Images(r, around, expected, good)
-    alike = _alike(data)
+    alike = _neighbour_noise(data)
     tests, chi2 = _tests(images, moments.shown, alike, a.shape[1], spread=moments.spread, noise_known=data.noise_known)
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
@@ -140,14 +140,14 @@ def harmonics_of(states: Array, angles_deg: Array) -> Array:
     return np.array([2 * abs(np.mean(states * np.exp(1j * h * turns))) for h in range(1, HARMONICS + 1)])
 
 
-def _alike(data: CaptureData) -> Array:
+def _neighbour_noise(data: CaptureData) -> Array:
     """Covariance (L, 2) of the noise of neighbours down and across, in units of that of wide patterns."""
     shared = data.shared
     moved = np.array([neighbour_noise(x, y, shared.right, shared.down) for x, y in data.row_moved_px])
     return np.asarray((moved + np.array([shared.columns, shared.rows])) / data.row_wide[:, None])
 
 
-def _around(signal: NDArray[np.float32]) -> NDArray[np.float32]:
+def _average_corners(signal: NDArray[np.float32]) -> NDArray[np.float32]:
     """The fit of four pixels around each.
 
     A pixel's own fit shares noise with its residual, since the states of a pixel are not equally noisy: with some

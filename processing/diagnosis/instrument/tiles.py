@@ -24,7 +24,7 @@ from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import Moments, Tiles
 from processing.diagnosis.instrument.pixel_sums import STRIP_PX, Part, Pixels
 from processing.diagnosis.instrument.projection import Projected, add_parts
-from processing.diagnosis.instrument.slopes import ChangesOf, fitted, slopes_of_rows, stepped
+from processing.diagnosis.instrument.slopes import ChangesOf, fitted, slopes_of_rows, step_values
 from processing.diagnosis.search.space import Space, Sums
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
@@ -200,7 +200,7 @@ def slopes_of_tiles(
         part.start + j: (tile_columns(model, data, moments, changes_of(moved)) - a) / step
         for candidate, part in fitted(space)
         if candidate.effect.varies_over_image
-        for j, (moved, step) in enumerate(stepped(candidate, part, values))
+        for j, (moved, step) in enumerate(step_values(candidate, part, values))
     }
     counted = np.flatnonzero(np.any(dc, axis=(1, 2)))
     return TileSlopes(

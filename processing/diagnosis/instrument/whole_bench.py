@@ -92,7 +92,7 @@ class WholeBench:
 
     def run(self) -> Posterior:
         """The posterior; again with what varies over the image, and with the noise that the light found has."""
-        plain = [c for c in self.pool if self._offered(c)]
+        plain = [c for c in self.pool if self._is_offered(c)]
         fixed = [*self.base.candidates, *self._clipped()]
         if self.whole.noise_known:
             start = Space(tuple(fixed))
@@ -147,7 +147,7 @@ class WholeBench:
     def _unknowns(self, k: int) -> int:
         return int(np.linalg.matrix_rank(self.whole.columns(k, self.whole.changes(k, Space(()), np.zeros(0)))))
 
-    def _offered(self, candidate: Candidate) -> bool:
+    def _is_offered(self, candidate: Candidate) -> bool:
         effect = candidate.effect
         if effect.varies_over_image or effect.is_switch:
             return False
@@ -185,11 +185,11 @@ class WholeBench:
         ]
         valid: list[Candidate] = []
         for candidate in sorted(per_state, key=lambda c: not c.effect.of_source):
-            if all(self._has_room(where, [*valid, candidate]) for where in map(self._seen_by, [*valid, candidate])):
+            if all(self._has_room(where, [*valid, candidate]) for where in map(self._captures_of, [*valid, candidate])):
                 valid.append(candidate)
         return set(per_state) - set(valid)
 
-    def _seen_by(self, candidate: Candidate) -> frozenset[int]:
+    def _captures_of(self, candidate: Candidate) -> frozenset[int]:
         return frozenset(k for k, nm in enumerate(self.whole.wavelengths_nm) if candidate.acts(k, nm))
 
     def _has_room(self, captures: frozenset[int], values: Sequence[Candidate]) -> bool:
@@ -202,7 +202,7 @@ class WholeBench:
             if self.whole.noise_known and data.usable.sum() > 1:
                 return True
             count += len(self.whole.model.channels) - (self.whole.model.projects_source and data.sample is not None)
-        return sum(self._seen_by(c) <= captures for c in values) < count
+        return sum(self._captures_of(c) <= captures for c in values) < count
 
     def _posterior(
         self, candidates: Sequence[Candidate], fixed: Sequence[Candidate], old: Posterior | None = None

@@ -45,7 +45,7 @@ class Wiring:
         return f"{self.mistake}: {self.change}"
 
 
-def miswired(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
+def find_miswiring(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
     """The mistake without which far less is left over; None if there is none, or where the train is only nominal.
 
     Parameters
@@ -68,7 +68,7 @@ def _fits_better(problem: InstrumentProblem, rewired: InstrumentProblem) -> bool
     return _chi2(problem, space, values) * WIRING < _chi2(rewired, Space(()), np.zeros(0))
 
 
-def miswired_train(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
+def find_train_miswiring(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
     """The same where the train has nominal values, none of which fit: each mistake is judged by the best of them."""
     base = Space(problem.nominal())
     mistakes = [*_mistakes(problem), *_other_wavelengths(problem, declared)]
@@ -97,9 +97,9 @@ def _mistakes(problem: InstrumentProblem) -> Iterator[Wiring]:
     model = problem.model
     axes = model.axes
     for axis in axes:
-        yield _scaled(problem, (axis,), -1.0, f"axis {axis!r} turns the other way")
+        yield _scale_angles(problem, (axis,), -1.0, f"axis {axis!r} turns the other way")
     if len(axes) == 2:
-        yield _scaled(problem, axes, -1.0, "both axes turn the other way")
+        yield _scale_angles(problem, axes, -1.0, "both axes turn the other way")
         swap = dict(zip(axes, reversed(axes), strict=True))
         elements = {e.name: {"axis": swap[e.axis]} for e in model.elements() if e.axis in swap}
         change = f"in the instrument file give each element the other axis ({axes[0]} and {axes[1]})"
@@ -107,11 +107,11 @@ def _mistakes(problem: InstrumentProblem) -> Iterator[Wiring]:
     groups: list[tuple[str, ...]] = [*((a,) for a in axes), tuple(axes)]
     for group in dict.fromkeys(groups):
         names = " and ".join(repr(a) for a in group)
-        yield _scaled(problem, group, 0.5, f"angles of {names} are told in half degrees")
-        yield _scaled(problem, group, 2.0, f"angles of {names} are told in units of two degrees")
+        yield _scale_angles(problem, group, 0.5, f"angles of {names} are told in half degrees")
+        yield _scale_angles(problem, group, 2.0, f"angles of {names} are told in units of two degrees")
     for axis in axes:
         for name, factor in GEARS.items():
-            yield _scaled(problem, (axis,), factor, f"axis {axis!r} was driven with a ratio of {name}")
+            yield _scale_angles(problem, (axis,), factor, f"axis {axis!r} was driven with a ratio of {name}")
     for element in model.elements():
         azimuth = float(element.azimuth_deg)  # type: ignore[arg-type]
         moved = _with_values(problem, {element.name: {"azimuth_deg": azimuth + 90.0}})
@@ -133,10 +133,10 @@ def _other_wavelengths(problem: InstrumentProblem, declared: InstrumentModel | N
             at = declared.nominal_at(wavelength)  # type: ignore[union-attr]
             text = f"the light is of {wavelength:g} nm, not of {wavelengths.copy().pop():g}"
             change = f"in the capture (or the states file), wavelength_nm: {wavelength:g}"
-            yield Wiring(text, change, _changed(problem, lambda _, m=at: m))  # type: ignore[misc]
+            yield Wiring(text, change, _change(problem, lambda _, m=at: m))  # type: ignore[misc]
 
 
-def _scaled(problem: InstrumentProblem, axes: tuple[str, ...], factor: float, text: str) -> Wiring:
+def _scale_angles(problem: InstrumentProblem, axes: tuple[str, ...], factor: float, text: str) -> Wiring:
     elements = {e.name: {"ratio": e.ratio * factor} for e in problem.model.elements() if e.axis in axes}
     lines = ", ".join(f"{name!r}: ratio: {update['ratio']:g}" for name, update in elements.items())
     return Wiring(text, f"in the instrument file, {lines}", _with_values(problem, elements))
@@ -156,16 +156,16 @@ def _turned_mosaics(problem: InstrumentProblem) -> Iterator[Wiring]:
         now = {str(a): str(b) for a, b in zip(layout.reshape(-1), turned.reshape(-1), strict=True)}
         # The pixels that were read as channel a show what channel b shows.
         channels = tuple(by_name[now[c.name]].model_copy(update={"name": c.name}) for c in model.channels)
-        new = _changed(problem, lambda m, c=channels: m.model_copy(update={"channels": c}))  # type: ignore[misc]
+        new = _change(problem, lambda m, c=channels: m.model_copy(update={"channels": c}))  # type: ignore[misc]
         yield Wiring(f"the image is {turn}", f"in the instrument file, mosaic: {turned.tolist()}", new)
 
 
-def _changed(problem: InstrumentProblem, change: Callable[[InstrumentModel], InstrumentModel]) -> InstrumentProblem:
+def _change(problem: InstrumentProblem, change: Callable[[InstrumentModel], InstrumentModel]) -> InstrumentProblem:
     return problem.with_models([change(m) for m in problem.models])
 
 
 def _with_values(problem: InstrumentProblem, updates: Mapping[str, Mapping[str, Any]]) -> InstrumentProblem:
-    return _changed(problem, lambda model: model.with_values(updates))
+    return _change(problem, lambda model: model.with_values(updates))
 
 
 def _with_states(problem: InstrumentProblem, move: Any) -> InstrumentProblem:

@@ -106,7 +106,7 @@ def sample(sets: Sets, state: State, visits: int, seed: int = 0) -> Samples:
         is_included = random.random() < 0.5
         state.tau[k] = sets.taus[int(random.choice(sets.taus.size, p=c.tau_weights[k]))] if is_included else 0.0
     # Where what is left is the noise, a set that leaves less has a smaller unit, and must be passed to step by step.
-    for alternative in swapped(sets, average.best) if sets.noise.known else ():
+    for alternative in swap_groups(sets, average.best) if sets.noise.known else ():
         c = sets.conditional(alternative)
         average.add(c, alternative, chance_of(sets, c))
     return average.samples()
@@ -117,7 +117,7 @@ def chance_of(sets: Sets, c: Conditional) -> Array:
     return np.where(sets.free, probability_at(c.log_odds), 1.0)
 
 
-def swapped(sets: Sets, state: State) -> Iterator[State]:
+def swap_groups(sets: Sets, state: State) -> Iterator[State]:
     """The set with one of its groups in turn exchanged for one that would do nearly as well in its place.
 
     Of two that say the same the chain may never see the second: it would have to pass a set with both or with none.
@@ -164,10 +164,10 @@ class ReducedSets:
             (curvature + curvature.T) / 2,
         )
         certain_count = int(np.sum(full.free[self.certain]))
-        self.sets = full.among(reduced_form, self.plausible, _renumbered(full, self.plausible), certain_count)
+        self.sets = full.among(reduced_form, self.plausible, _renumber(full, self.plausible), certain_count)
         self.start = State(state.tau[self.plausible].copy(), unit)
 
-    def lifted(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
+    def lift(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Mean (K,) and covariance (K, K) of all parameters, of those of the groups that are kept."""
         size = self._whole.size
         full, spread = np.zeros(size), np.zeros((size, size))
@@ -203,7 +203,7 @@ def _positions(sets: Sets, groups: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.concatenate([np.zeros(0, dtype=np.int64), *(sets.groups[k].index for k in groups)])
 
 
-def _renumbered(sets: Sets, groups: NDArray[np.int64]) -> list[Group]:
+def _renumber(sets: Sets, groups: NDArray[np.int64]) -> list[Group]:
     out, first = [], 0
     for k in groups:
         size = sets.groups[k].index.size
@@ -279,7 +279,7 @@ def stay(sets: Sets, state: State, changes: int, seed: int = 0) -> Samples:
     inclusion[:, reduced.certain] = True
     inclusion[:, reduced.plausible] = inside
     best = reduced.whole_state(average.best[1] if average.best else reduced.start)
-    return Samples(probability, *reduced.lifted(mean, covariance), inclusion, weight, best)
+    return Samples(probability, *reduced.lift(mean, covariance), inclusion, weight, best)
 
 
 def _starts(sets: Sets, state: State) -> list[tuple[State, float]]:
@@ -291,7 +291,7 @@ def _starts(sets: Sets, state: State) -> list[tuple[State, float]]:
     indices = np.flatnonzero((state.tau > 0) & sets.free)
     instead = (climb(sets, sets.without(state, int(k)), without=int(k)) for k in indices)
     several = (State(s.tau, state.unit) for s in instead)
-    states = {s.tau.tobytes(): s for s in (state, *swapped(sets, state), *several)}.values()
+    states = {s.tau.tobytes(): s for s in (state, *swap_groups(sets, state), *several)}.values()
     score = np.array([sets.fitted(s).score for s in states])
     share = np.exp(score - score.max())
     share /= share.sum()

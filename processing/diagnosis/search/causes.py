@@ -121,7 +121,7 @@ def information(posterior: Posterior) -> tuple[Array, NDArray[np.int64]]:
     return precision, always
 
 
-def would_be_seen(posterior: Posterior) -> tuple[Candidate, ...]:
+def observable_effects(posterior: Posterior) -> tuple[Candidate, ...]:
     """Effects of optics, source or surface that at a typical size would stand out of the noise, or of what is left."""
     precision, always = information(posterior)
     precision /= posterior.samples.best.unit

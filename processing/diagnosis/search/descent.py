@@ -57,7 +57,7 @@ def alone(problem: Problem, space: Space, chosen: Sequence[int]) -> Array:
 def next_values(problem: Problem, space: Space, sets: Sets, state: State, *, x: Array) -> tuple[Array, bool]:
     """Values (K,) about which to linearize next, and whether they are so near to x (K,) that there is no need."""
     samples = sample(sets, state, SAMPLES_BEFORE)
-    new = improved(problem, space, sets.groups, samples, starts=[mean_over_sets(space, samples, x), x])
+    new = descend(problem, space, sets.groups, samples, starts=[mean_over_sets(space, samples, x), x])
     spread = np.sqrt(np.maximum(np.diag(samples.covariance), 1e-12)) * space.joined("typical")
     return new, bool(np.all(np.abs(new - x) < SETTLED * spread))
 
@@ -68,7 +68,7 @@ def mean_over_sets(space: Space, samples: Samples, x: Array) -> Array:
     return np.where(space.fixed, x, np.clip(samples.mean * typical, lower, upper))
 
 
-def improved(
+def descend(
     problem: Problem,
     space: Space,
     groups: Sequence[Group],

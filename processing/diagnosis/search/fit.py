@@ -99,7 +99,7 @@ def _descend(
     x = np.clip(x, lower, upper)
     sums, damping = problem.sums(space, x), 0.0
     reference = float(sums.freedom[use].sum())
-    cost = _penalized(sums, weak, x, use, reference=reference)
+    cost = _penalize(sums, weak, x, use, reference=reference)
     for _ in range(steps):
         # A bend of the response stretches residual and noise alike, which is no gain.
         unit = sums.excess[use].sum() / max(float(sums.freedom[use].sum()), 1e-300)
@@ -114,7 +114,7 @@ def _descend(
             step[move] = -np.linalg.solve(hm + damping * np.diag(np.diag(hm)), gm)
             tried = np.clip(x + step, lower, upper)
             # Derivatives are most of the work; a step that is refused needs none.
-            now = _penalized(problem.sums(space, tried, derivatives=False), weak, tried, use, reference=reference)
+            now = _penalize(problem.sums(space, tried, derivatives=False), weak, tried, use, reference=reference)
             if now <= cost or damping > MOST_DAMPING:
                 break
             damping = max(damping * STIFFER, FIRST_DAMPING)
@@ -128,7 +128,7 @@ def _descend(
     return Fit(x, sums, float(sums.excess[use].sum()))
 
 
-def _penalized(sums: Sums, weak: Array, values: Array, use: Sequence[int], *, reference: float) -> float:
+def _penalize(sums: Sums, weak: Array, values: Array, use: Sequence[int], *, reference: float) -> float:
     """Chi-square over its stretch, of some folds whose noise is `reference` as a whole, and the prior."""
     freedom = max(float(sums.freedom[use].sum()), 1e-300)
     return float(sums.excess[use].sum() * reference / freedom + weak @ values**2)
@@ -213,7 +213,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
         if local.any():
             start = np.where(local, full.values, values)
             fit = minimize(problem, space, start, [fold], free=local, steps=3)
-            determined = _determined(fit.sums.curvature[fold], weak, local)
+            determined = _count_determined(fit.sums.curvature[fold], weak, local)
             spent += determined
             total[3] -= determined.sum()
             if problem.noise_known:
@@ -229,7 +229,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
     return HeldOut(excess, freedom, square, count, shares)
 
 
-def _determined(curvature: Array, weak: Array, local: BoolArray) -> Array:
+def _count_determined(curvature: Array, weak: Array, local: BoolArray) -> Array:
     """What share of each local value the data determine, against the prior and the other local values; 0 elsewhere."""
     h = curvature[np.ix_(local, local)]
     shares = np.zeros(local.size)

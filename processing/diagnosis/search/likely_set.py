@@ -23,7 +23,7 @@ def likely_set(sets: Sets, initial: BoolArray | None = None) -> State:
     One search starts from the groups `initial` (G,), in the unit of noise: in that of structure a prior is too stiff
     for a cause that explains it.
     """
-    states = [climb(sets, sets.empty()), climb(sets, thinned(sets))]
+    states = [climb(sets, sets.empty()), climb(sets, thin_out(sets))]
     if initial is not None:
         begin = State(np.where(initial & sets.free, 1.0, sets.empty().tau), sets.noise.floor)
         retune(sets, begin)
@@ -60,7 +60,7 @@ def everything(sets: Sets) -> State:
     return State(np.where(sets.free & (sets.share == 1) & (sets.price == 0), 1.0, sets.empty().tau))
 
 
-def thinned(sets: Sets) -> State:
+def thin_out(sets: Sets) -> State:
     """From everything, the least needed taken away until all are needed; the likeliest of these."""
     state = sets.settled(everything(sets))
     best, best_state = -np.inf, state.copy()

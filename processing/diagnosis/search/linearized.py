@@ -13,7 +13,7 @@ from processing.diagnosis.search.sets import Group, Noise, Quadratic
 from processing.diagnosis.search.space import Problem, Space, Sums
 
 
-def grouped(space: Space, fixed: Sequence[Candidate]) -> tuple[tuple[tuple[int, ...], ...], list[Group]]:
+def group_candidates(space: Space, fixed: Sequence[Candidate]) -> tuple[tuple[tuple[int, ...], ...], list[Group]]:
     """Candidates of each group, and the groups: one kind at one place in all captures."""
     by_key: dict[tuple[str, str, int | None], list[int]] = {}
     for k, c in enumerate(space.candidates):

@@ -18,13 +18,13 @@ from processing.diagnosis.search.descent import (
     STEPS,
     all_at_once,
     alone,
-    improved,
+    descend,
     mean_over_sets,
     minimum_of,
     next_values,
 )
 from processing.diagnosis.search.likely_set import likely_set
-from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
+from processing.diagnosis.search.linearized import group_candidates, noise_of, quadratic
 from processing.diagnosis.search.rules import (
     ALTERNATIVE,
     BENT,
@@ -99,7 +99,7 @@ def fit_posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], st
     fixed : candidates that are always there (nominal values of the train, switches that are on).
     start : (K,) values to begin with.
     """
-    members, groups = grouped(space, fixed)
+    members, groups = group_candidates(space, fixed)
     about, sets, state, rivals = _expand(problem, space, fixed, members, groups=groups, start=start)
     # Where what is left is the noise, each set has a unit of its own, and counts by its evidence.
     samples = stay(sets, state, CHANGES) if sets.noise.known else sample(sets, state, SAMPLES)
@@ -235,5 +235,5 @@ def _posterior_of(
     sums = problem.sums(space, values, derivatives=False)
     if not sets.noise.unit(sums.chi2(problem.noise_known)) <= GROWTH * sets.noise.unit(sets.form.at(values / typical)):
         # The least certain values lie along a bent valley, in which the straight line to their mean does not stay.
-        values = improved(problem, space, sets.groups, samples, starts=[about], steps=2 * STEPS)
+        values = descend(problem, space, sets.groups, samples, starts=[about], steps=2 * STEPS)
     return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical), rivals)

@@ -10,7 +10,7 @@ import numpy as np
 from processing.arrays import Array
 from processing.computing.blas import one_blas_thread
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import causes, would_be_seen
+from processing.diagnosis.search.causes import causes, observable_effects
 from processing.diagnosis.search.correction import solution
 from processing.diagnosis.search.decision import Judgement, beyond_chance, in_words
 from processing.diagnosis.search.fit import Fit, Solution
@@ -67,7 +67,7 @@ def diagnose_surface(problem: SurfaceProblem, material: str, say: Say) -> Surfac
     posterior = fit_posterior(problem, space, (), np.zeros(space.size), say=say)
     say("testing what is left over")
     solved, captures = solution(problem, posterior, Space(()), np.zeros(0)), range(len(problem.captures))
-    posterior, covariance, wider = as_wide_as_the_valley(problem, posterior, solved)
+    posterior, covariance, wider = widen_errors(problem, posterior, solved)
     (before, _), (after, excess) = (
         zip(*(structure(problem, k, at, fit.values) for k in captures), strict=True) for at, fit in solved.ends
     )
@@ -77,7 +77,7 @@ def diagnose_surface(problem: SurfaceProblem, material: str, say: Say) -> Surfac
         named=bool(names.named),
         sure=bool(names.named),
         structure=has_structure,
-        observable=bool(would_be_seen(posterior)),
+        observable=bool(observable_effects(posterior)),
         figures=checks(problem, solved),
         chances=chances(problem, solved, covariance),
     )
@@ -100,9 +100,7 @@ def names_of(posterior: Posterior, wider: Array, chi2: float) -> Names:
     return Names(tuple(named), {})
 
 
-def as_wide_as_the_valley(
-    problem: SurfaceProblem, posterior: Posterior, solved: Solution
-) -> tuple[Posterior, Array, Array]:
+def widen_errors(problem: SurfaceProblem, posterior: Posterior, solved: Solution) -> tuple[Posterior, Array, Array]:
     """The posterior and the covariance of the values that are corrected, as wide as the chi-square is.
 
     Also by how much wider each value (K,) of the posterior is.
@@ -199,14 +197,14 @@ def recommended(
     for candidate in rivals:
         if candidate.effect.advice:
             return candidate.effect.advice
-    if len(rivals) > 1 and _apart(problem, space, fit, rivals) >= APART:
+    if len(rivals) > 1 and _least_angle(problem, space, fit, rivals) >= APART:
         return "Their signatures differ: repeat the capture with more light or more frames."
     if rank_of(problem.rows(0, space, fit.values)) < 16:
         return "Take a full Mueller capture of the same object: one angle of polarization at each pixel is too little."
     return "Take captures at two more arm angles, at least 30 degrees apart, and diagnose them together."
 
 
-def _apart(problem: SurfaceProblem, space: Space, fit: Fit, rivals: Sequence[Candidate]) -> float:
+def _least_angle(problem: SurfaceProblem, space: Space, fit: Fit, rivals: Sequence[Candidate]) -> float:
     """Smallest sine between the signatures of two rivals in these captures."""
     signatures = []
     for candidate in rivals:

@@ -205,7 +205,7 @@ class SurfaceProblem:
             f=f,
             hold=hold,
             residual=y - e * level[:, None] - f * along[:, None],
-            free=1 - e**2 - f**2 * (1 - _left(full, data.tile))[:, None],
+            free=1 - e**2 - f**2 * (1 - _noise_left(full, data.tile))[:, None],
             alpha_0=alpha_0,
             alpha_id=alpha_id,
             strength=strength,
@@ -247,12 +247,12 @@ class SurfaceProblem:
         """Derivatives (K, P, L) of the residual by every value, and (K, P) of the noise that is expected in it."""
         d, less = np.empty((space.size, *px.residual.shape)), np.empty((space.size, len(px.most)))
         tile = self.captures[k].tile
-        before, noise = _left(px.strength * px.most, tile), self.noise[k].mean(axis=1)
+        before, noise = _noise_left(px.strength * px.most, tile), self.noise[k].mean(axis=1)
         for j, (step, columns, flat, light) in enumerate(self._moved(k, space, values)):
             change = (columns - px.columns) * px.alpha_0[:, None] + (flat - px.flat) * px.alpha_id[:, None]
             d[j] = -px.outside(change + light - px.extra) / step
             strength = np.sqrt(np.sum((columns - px.e * np.sum(px.e * columns, axis=1, keepdims=True)) ** 2, axis=1))
-            less[j] = noise * (_left(strength * px.most, tile) - before) / step
+            less[j] = noise * (_noise_left(strength * px.most, tile) - before) / step
         return d, less
 
     def _moved(self, k: int, space: Space, values: Array) -> Iterator[tuple[float, Array, Array, Array]]:
@@ -285,7 +285,7 @@ def _held(full: Array, tile: NDArray[np.int64]) -> tuple[Array, Array]:
     return hold, np.asarray(np.bincount(tile, hold * full**2)[tile] + 1e-300)
 
 
-def _left(full: Array, tile: NDArray[np.int64]) -> Array:
+def _noise_left(full: Array, tile: NDArray[np.int64]) -> Array:
     """Part (P,) of the noise along the second column that is left over once q and its mean are fitted."""
     hold, weight = _held(full, tile)
     return np.asarray(hold * (1 - hold * full**2 / weight))

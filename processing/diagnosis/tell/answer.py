@@ -155,7 +155,7 @@ def stretch(problem: Asked, solved: Solution, k: int | None = None) -> float:
     return problem.noise_floor(solved.space, solved.fit.values, k) / before if before > 0 else 1.0
 
 
-def left_without(problem: Asked, solved: Solution, effects: Collection[Candidate]) -> HeldOut:
+def held_out_without(problem: Asked, solved: Solution, effects: Collection[Candidate]) -> HeldOut:
     """What the correction would leave without some of its effects; for each degree of freedom, as after it."""
     values = solved.fit.values.copy()
     for candidate, part in solved.space.pairs:
@@ -170,7 +170,7 @@ def effects_of_cause(
     problem: Asked, solved: Solution, cause: Cause, doubt: str | None, *, not_applied: str | None
 ) -> list[FoundEffect]:
     """A cause as it is told, given a reason to doubt it; one for each capture in which it shows."""
-    without = left_without(problem, solved, (*cause.candidates, *cause.alternatives))
+    without = held_out_without(problem, solved, (*cause.candidates, *cause.alternatives))
     if not any(c in solved.space.candidates for c in (*cause.candidates, *cause.alternatives)):
         not_applied = not_applied or doubt or "it is not needed in addition to the other causes"
     answer, probability = answer_of(cause, doubt)
@@ -213,7 +213,7 @@ def effects_of_switches(problem: Asked, solved: Solution) -> list[FoundEffect]:
     for candidate, part in solved.space.pairs:
         if candidate.effect.is_switch:
             value, never = solved.fit.values[part], np.zeros((1, 1))
-            gain = left_without(problem, solved, (candidate,)).excess - solved.after.excess
+            gain = held_out_without(problem, solved, (candidate,)).excess - solved.after.excess
             cause = Cause((candidate,), (value,), (never,), probability=1.0, log_odds=gain / 2, alternatives=())
             effects += effects_of_cause(problem, solved, cause, None, not_applied=None) if gain > 2 * NEEDED else []
     return effects
