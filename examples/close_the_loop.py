@@ -24,7 +24,7 @@ write_virtual_capture(folder / "bent.h5", bench, instrument, omega_deg=35)
 judged, _ = diagnose_captures([folder / "bent.h5"], instrument)
 print(judged.diagnosis.verdict)
 for effect in judged.diagnosis.effects:
-    print(effect.kind, {name: entry.told for name, entry in effect.parameters.items()})
+    print(effect.kind, {name: entry.text for name, entry in effect.parameters.items()})
 write_instrument(folder / "corrected.yaml", instrument, judged.diagnosis)
 
 truth = np.moveaxis(np.asarray(scene.mueller_image(35, 662, 100, 100)), (2, 3), (0, 1))

@@ -159,7 +159,7 @@ def curve(reducer: PixelReducer, region: Region) -> dict[str, Any]:
 
 def matrix(image: MuellerImage | ExtrapolatedImage) -> dict[str, Any]:
     """Mueller matrix over m00 with its standard errors, and what it decomposes into."""
-    measured = (image.seen if isinstance(image, MuellerImage) else np.ones(16, dtype=bool)).reshape(4, 4)
+    measured = (image.is_determined if isinstance(image, MuellerImage) else np.ones(16, dtype=bool)).reshape(4, 4)
     m, errors = (np.where(measured, v.reshape(4, 4), np.nan).astype(float) for v in (image.values, image.errors))
     derived = quantities_block(image, (), {}) if measured.all() else {}
     values_of = {name: values.reshape(-1).astype(float) for name, values in derived.items()}

@@ -21,7 +21,7 @@ def cause_rows(demo: Demo) -> list[tuple[str, str]]:
 
 def effect_line(effect: FoundEffect) -> str:
     """Kind, values with their errors, and how sure the name is."""
-    values, units = zip(*((p.told, p.unit) for p in effect.parameters.values()), strict=True)
+    values, units = zip(*((p.text, p.unit) for p in effect.parameters.values()), strict=True)
     text = ", ".join(values[:MOST_VALUES]) + (", ..." if len(values) > MOST_VALUES else "")
     text += "" if units[0] == "1" else f" {units[0]}"
     equal = len({name.partition("[")[0] for name in effect.indistinguishable_from} - {effect.kind})
@@ -33,7 +33,7 @@ def figure_rows(demo: Demo) -> list[tuple[str, str, str, str]]:
     """Name, value before, value after, and what photon noise alone gives."""
     d, before, after = demo.judged.diagnosis, demo.before, demo.after
     return [
-        ("residual beyond noise", d.error_before.told, d.error_after.told, ""),
+        ("residual beyond noise", d.error_before.text, d.error_after.text, ""),
         ("error of M/m00", f"{before.mueller_rms:.4f}", f"{after.mueller_rms:.4f}", f"{after.mueller_noise:.4f}"),
         ("error of xi0", f"{before.xi0_rms:.4f}", f"{after.xi0_rms:.4f}", f"{after.xi0_noise:.4f}"),
     ]

@@ -183,7 +183,7 @@ def _budget(sphere: SphereStudy, wavelengths: Sequence[float]) -> ReportSection:
 def _fault(fault: FaultStudy, wavelengths: Sequence[float]) -> ReportSection:
     lines = []
     for effect in fault.result.effects:
-        values = ", ".join(f"{name} {value.told} {value.unit}" for name, value in effect.parameters.items())
+        values = ", ".join(f"{name} {value.text} {value.unit}" for name, value in effect.parameters.items())
         lines.append((f"found: {effect.kind}", values))
     text = f"{FAULT['parameter']} of {FAULT['element']} is {FAULT['offset']:g} degrees off, which no file says"
     summary = [("the fault", text), ("diagnose", f"{fault.result.verdict}. {fault.result.recommendation}"), *lines]

@@ -55,7 +55,7 @@ class Score:
     ----------
     intensities : rows of W.
     rank : of W.
-    wanted : rank that the instrument can have; below it the other numbers are infinite.
+    full_rank : rank that the instrument can have; below it the other numbers are infinite.
     condition_number : of W, among what the instrument can determine.
     equally_weighted_variance : trace (W^T W)^-1, of the same.
     bound : the least that any table with as many intensities can have.
@@ -65,7 +65,7 @@ class Score:
 
     intensities: int
     rank: int
-    wanted: int
+    full_rank: int
     condition_number: float
     equally_weighted_variance: float
     bound: float

@@ -100,7 +100,7 @@ def design_command(
         result = score(w, noise, determined_basis(model), bound_of(model, intensities))
         at = f", {nm:g} nm" if nm else ""
         _show(f"{model.name}{at}, {len(chosen)} states", result, noise)
-        if result.rank == result.wanted:
+        if result.rank == result.full_rank:
             from processing.commands.loaded_late.design_angles import tell_robustness
 
             tell_robustness(model, chosen.angles_deg)
@@ -186,12 +186,12 @@ def _optimized(
 
 def _show(title: str, result: Score, noise: AssumedNoise) -> None:
     typer.echo(title)
-    typer.echo(f"  rank {result.rank} of {result.wanted}, condition number {result.condition_number:.4g}")
+    typer.echo(f"  rank {result.rank} of {result.full_rank}, condition number {result.condition_number:.4g}")
     typer.echo(
         f"  equally weighted variance {result.equally_weighted_variance:.4g}; the bound for {result.intensities} "
         f"intensities is {result.bound:.4g}"
     )
-    if result.rank < result.wanted:
+    if result.rank < result.full_rank:
         typer.echo(
             "  these states do not determine all that the instrument can: take another ratio, or less regular steps"
         )

@@ -26,7 +26,7 @@ class EffectParameter(Section):
     )
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         """The value to the last of two digits of its standard error; the range of many values."""
         if isinstance(self.value, tuple):
             return f"{len(self.value)} values, {min(self.value):.4g} to {max(self.value):.4g}"

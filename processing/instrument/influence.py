@@ -121,7 +121,7 @@ def _name(effect: AppliedEffect) -> str:
 
 def _values(effect: AppliedEffect) -> str:
     def one(name: str, p: EffectParameter) -> str:
-        return f"{name} {p.told}" + ("" if p.unit in ("1", "") else f" {p.unit}")
+        return f"{name} {p.text}" + ("" if p.unit in ("1", "") else f" {p.unit}")
 
     return ", ".join(one(name, p) for name, p in effect.parameters.items())
 
@@ -139,8 +139,8 @@ def _numbers(value: Dispersive | None, stderr: Dispersive) -> str:
 
     at_nm = sorted({nm for of in (value, stderr) if isinstance(of, dict) for nm in of})
     text = [
-        (EffectParameter(value=at(value, nm), stderr=at(stderr, nm), unit="").told, f" at {nm:g} nm") for nm in at_nm
+        (EffectParameter(value=at(value, nm), stderr=at(stderr, nm), unit="").text, f" at {nm:g} nm") for nm in at_nm
     ]
     if not at_nm:
-        text = [(EffectParameter(value=at(value, 0.0), stderr=at(stderr, 0.0), unit="").told, "")]
+        text = [(EffectParameter(value=at(value, 0.0), stderr=at(stderr, 0.0), unit="").text, "")]
     return ", ".join(number + where for number, where in text)

@@ -224,7 +224,7 @@ def whole_range(name: str, value: Array) -> tuple[Array, Array]:
 def moves_of(systematic: Systematic, image: MuellerImage) -> Array:
     """What one standard uncertainty of each uncertain input of the instrument does to M: (D, 16, rows, columns)."""
     # What a partial polarimeter does not determine is zero in the solution of least norm.
-    values = np.where(image.seen[:, None], image.values.reshape(16, -1), 0)
+    values = np.where(image.is_determined[:, None], image.values.reshape(16, -1), 0)
     return np.stack(list(systematic.moves(values))).reshape(-1, 16, *image.mask.shape)
 
 

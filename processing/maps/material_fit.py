@@ -120,7 +120,7 @@ def _of_mueller(source: Path, view: ViewingGeometry) -> _Data:
         moves = moves_of_light(systematic, image).reshape(len(inputs), 4, 4, -1)
         for direction, move in zip(systematic.directions, moves, strict=True):
             if image.sent is None:
-                moved.append((values + move.reshape(16, -1)[image.seen], rows))
+                moved.append((values + move.reshape(16, -1)[image.is_determined], rows))
             else:
                 is_sent = sent_parts(image.sent)
                 moved.append((values + move[is_sent, 0], sent_rows(direction.rows)[is_sent]))
@@ -133,7 +133,7 @@ def determined_values(image: MuellerImage) -> tuple[NDArray[np.float64], NDArray
     Elements of M, or the Stokes vector that is sent back where no element is determined alone.
     """
     if image.sent is None:
-        return image.values.reshape(16, -1)[image.seen].astype(float), np.eye(16)[image.seen]
+        return image.values.reshape(16, -1)[image.is_determined].astype(float), np.eye(16)[image.is_determined]
     is_sent = sent_parts(image.sent)
     return image.sent.reshape(4, -1)[is_sent].astype(float), sent_rows(image.w)[is_sent]
 

@@ -180,7 +180,7 @@ class _Mean:
     def alike(self) -> tuple[object, ...]:
         """What captures of one mean have in common."""
         i = self.image
-        rank = tuple(i.seen) if isinstance(i, MuellerImage) else ()
+        rank = tuple(i.is_determined) if isinstance(i, MuellerImage) else ()
         return type(i), rank, round(i.header.wavelength_nm), i.simulated, bool(self.inputs)
 
     @classmethod
@@ -228,7 +228,7 @@ def _variance_of_sum(sigma: NDArray[np.floating], good: NDArray[np.bool_], corre
 def _mueller_mean(image: MuellerImage, columns: slice, source: Path) -> MuellerImage:
     values = image.values[..., columns].reshape(16, image.mask.shape[0], -1).astype(float)
     errors = image.errors[..., columns].reshape(values.shape).astype(float)
-    good = _good(image.mask[:, columns], values[image.seen], source)
+    good = _good(image.mask[:, columns], values[image.is_determined], source)
     count = int(good.sum())
     # Pixels of a Mueller image share no noise.
     total = np.square(errors[:, good]).sum(axis=1)
@@ -313,8 +313,8 @@ def _stokes_numbers(image: StokesImage, moves: Array) -> dict[str, _Number]:
 
 def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
     numbers, m = {}, image.values.reshape(16).astype(float)
-    light = is_first_column(image.seen)
-    for k in np.flatnonzero(image.seen).tolist():
+    light = is_first_column(image.is_determined)
+    for k in np.flatnonzero(image.is_determined).tolist():
         gradient = np.zeros(16)
         # A common gain is not measured: the error of m00 is noise alone.
         value = m[0] if k == 0 else m[k] / m[0]
@@ -330,11 +330,11 @@ def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
         numbers[name] = _Number(float(value), error, moved, unit)
     by_input: dict[str, NDArray[Any]] = {}
     # Intervals by noise alone first: those of the second are wider by the instrument's uncertainty.
-    if image.seen.all():
+    if image.is_determined.all():
         planes = quantities_block(image, (), PAPER_PAIRS)
         quantities_block(image, (), PAPER_PAIRS, moves, by_input=by_input)
     else:
-        names = light_quantities(image.seen) if light else determined_maps(image.seen, PAPER_PAIRS)
+        names = light_quantities(image.is_determined) if light else determined_maps(image.is_determined, PAPER_PAIRS)
         planes = partial_block(image, names, PAPER_PAIRS)
         partial_block(image, names, PAPER_PAIRS, moves, by_input=by_input)
     if light:

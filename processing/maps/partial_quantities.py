@@ -56,7 +56,7 @@ def partial_block(
     `moves` and `by_input` are those of `processing.maps.quantities.quantities_block`.
     """
     # What was not determined is not in any of them.
-    m = np.where(image.seen.reshape(4, 4), image.matrices.astype(float), 0.0)
+    m = np.where(image.is_determined.reshape(4, 4), image.matrices.astype(float), 0.0)
     planes: dict[str, NDArray[Any]] = {}
     with np.errstate(divide="ignore", invalid="ignore"):
         derived = gradients.diattenuation(m) | gradients.polarizance(m) | gradients.pairs(m, pairs)

@@ -229,7 +229,7 @@ def xi0_of_partial(
     with Product(source) as product:
         product.require("mueller")
         image, systematic = MuellerImage.of(product), Systematic.of_product(product)
-    is_determined = image.seen if image.sent is None else sent_parts(image.sent)
+    is_determined = image.is_determined if image.sent is None else sent_parts(image.sent)
     if is_determined.sum() < 2:
         raise ProcessError(f"{source} determines {image.facts['determined']}, and xi0 needs two numbers or more.")
     m0 = dominant_model(image.header, geometry_file, material_file, image.mask.shape)

@@ -97,7 +97,7 @@ def reduce_mueller(
         facts |= _further_facts(reduction) | references(capture, model) | exposure_fact(capture, reduction.states)
         facts |= reduction.systematic.store(product) if reduction.systematic is not None else {}
         if levels is not None:
-            facts["source"] = levels.told
+            facts["source"] = levels.text
         product.seal(facts)
     return facts
 

@@ -220,7 +220,7 @@ class MuellerReduction:
             planes |= self.sent.planes(planes["mueller"], planes["residual_rms"], solver)
             if self.systematic is not None:
                 planes["stokes_systematic"] = self.systematic.errors(planes["mueller"], self.sent.rows)
-                planes["stokes_systematic"][~self.sent.seen] = np.nan
+                planes["stokes_systematic"][~self.sent.is_determined] = np.nan
         elif self.systematic is not None:
             planes["mueller_systematic"] = self.systematic.errors(planes["mueller"])
         _blank(planes, lost, ~determined_elements(self.inversion.basis))

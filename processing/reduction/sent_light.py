@@ -48,11 +48,11 @@ class SentLight:
     Attributes
     ----------
     rows : (4, 16), S = rows . vec(M), for a light of intensity 1.
-    seen : (4,), which of S0 to S3 the states determine.
+    is_determined : (4,), which of S0 to S3 the states determine.
     """
 
     rows: NDArray[np.float64]
-    seen: BoolArray
+    is_determined: BoolArray
 
     @classmethod
     def of(cls, inversion: Inversion) -> Self | None:
@@ -69,7 +69,7 @@ class SentLight:
     @property
     def named(self) -> str:
         """What is determined, in words."""
-        names = ", ".join(f"S{k}" for k in np.flatnonzero(self.seen))
+        names = ", ".join(f"S{k}" for k in np.flatnonzero(self.is_determined))
         return f"{names} of the light that the sample sends back (dataset stokes)"
 
     def planes(self, mueller: NDArray[np.float32], residual_rms: NDArray[np.float32], solver: Solver) -> dict[str, Any]:
@@ -88,5 +88,5 @@ class SentLight:
         drive = np.einsum("knc,nd->kcd", solve.reshape(4, -1, channels), solver.reader.black_weights) ** 2
         dark = (drive @ solver.black_variance).sum(axis=1)
         errors = np.sqrt(solve**2 @ variance + dark[:, None]).astype(np.float32)
-        stokes[~self.seen], errors[~self.seen] = np.nan, np.nan
+        stokes[~self.is_determined], errors[~self.is_determined] = np.nan, np.nan
         return {"stokes": stokes, "stokes_errors": errors}

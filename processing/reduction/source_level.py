@@ -77,7 +77,7 @@ class SourceLevels:
         planes["mueller_errors"] = np.sqrt(variance).astype(np.float32)
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         """In words, for the facts of a product."""
         return (
             f"its level in each of {self.relative.size} states is projected out (standard deviation "

@@ -51,7 +51,7 @@ def test_a_stokes_polarimeter_is_scored_by_what_it_determines(stokes):
     assert found.bound == pytest.approx(bound_of(stokes, 8)) == pytest.approx(5.0)
     assert found.variance < 1.01 * found.bound
     said = score(stokes.rows(found.angles_deg), AssumedNoise(20_000, 3), basis, found.bound)
-    assert (said.rank, said.wanted) == (4, 4)
+    assert (said.rank, said.full_rank) == (4, 4)
     assert np.isfinite(said.element_stderr[:, 0]).all()
     assert np.isnan(said.element_stderr[:, 1:]).all()
     with pytest.raises(ProcessError, match="3 states give 3 intensities"):

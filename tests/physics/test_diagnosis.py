@@ -261,7 +261,7 @@ def test_an_instrument_file_that_is_larger_than_what_is_read_is_not_written(conf
     ],
 )
 def test_a_value_is_told_as_far_as_it_is_known(value, stderr, told):
-    assert EffectParameter(value=value, stderr=stderr, unit="1").told == told
+    assert EffectParameter(value=value, stderr=stderr, unit="1").text == told
 
 
 def test_states_at_which_an_axis_may_have_slipped_are_told_in_one():

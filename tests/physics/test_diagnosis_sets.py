@@ -20,7 +20,7 @@ from processing.effect import Effect, Parameter
 from processing.instrument.effects.rotation_slip import RotationSlip
 
 #: Nothing but noise, whose unit is one.
-QUIET = Noise(known=True, directions=30.0, slack=1e9)
+QUIET = Noise(is_known=True, directions=30.0, slack=1e9)
 
 
 def form(design, truth, seed=0):
@@ -150,7 +150,7 @@ def test_several_causes_that_are_plain_only_together_are_found():
     design = 100 * random.standard_normal((60, 30))
     truth = np.zeros(30)
     truth[[2, 7, 11, 19, 23, 28]] = random.choice([-1, 1], 6)
-    noise = Noise(known=True, directions=25.0, slack=25.0)
+    noise = Noise(is_known=True, directions=25.0, slack=25.0)
     state = likely_set(Sets(form(design, truth), groups(*[1] * 30), noise))
     assert set(np.flatnonzero(state.tau)) == {2, 7, 11, 19, 23, 28}
     assert state.unit == 1.0
@@ -161,7 +161,7 @@ def test_structure_that_no_set_explains_widens_the_errors():
     design = 10 * random.standard_normal((60, 6))
     data = design @ np.array([1.0, 0, 0, 0, 0, 0]) + 30 * random.standard_normal(60)
     quadratic = Quadratic(float(data @ data - 60), -design.T @ data, design.T @ design)
-    state = likely_set(Sets(quadratic, groups(*[1] * 6), Noise(known=True, directions=60.0, slack=22.0)))
+    state = likely_set(Sets(quadratic, groups(*[1] * 6), Noise(is_known=True, directions=60.0, slack=22.0)))
     assert state.unit == pytest.approx(900, rel=0.4)
     assert not state.tau[1:].any()
 
@@ -199,7 +199,7 @@ def test_of_those_that_may_be_there_alone_never_two_are():
     design[:, 1] = design[:, 0] + 0.05 * design[:, 1]
     quadratic = form(20 * design, np.array([2.0, -1.0, 0.5, 0.0, 0.0, 0.0]))
     alike = [Group(np.array([k]), alone=k < 2) for k in range(6)]
-    sets = Sets(quadratic, alike, Noise(known=True, directions=30.0, slack=1e9))
+    sets = Sets(quadratic, alike, Noise(is_known=True, directions=30.0, slack=1e9))
     assert likely_set(Sets(quadratic, groups(*(1,) * 6), sets.noise)).tau[:2].all()
     state = likely_set(sets)
     assert np.sum(state.tau[:2] > 0) == 1
@@ -221,7 +221,7 @@ def test_the_state_that_a_slip_begins_at_is_one_of_those_that_the_data_leave_ope
     told = {c.place for c in (*cause.candidates, *cause.alternatives)}
     assert cause.answer == "one of"
     assert told == {"psg@14", "psg@15"}
-    assert cause.others == ()
+    assert cause.other_effects == ()
 
 
 def slipped(first):

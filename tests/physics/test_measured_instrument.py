@@ -51,7 +51,7 @@ def test_a_measured_w_reduces_a_mueller_capture_in_any_order(synthetic_capture):
     path = capture_of(synthetic_capture, w, true, model, order=RNG.permutation(24))
     image = MuellerImage.load(Reduction(path).make())
     m = image.values.mean(axis=(2, 3)).reshape(16)
-    assert image.seen.all()
+    assert image.is_determined.all()
     np.testing.assert_allclose(m / m[0], true / true[0], atol=1e-3)
 
 
@@ -63,7 +63,7 @@ def test_a_measured_w_of_four_numbers_is_a_stokes_polarimeter(synthetic_capture)
     with Capture(path) as capture:
         assert capture.reduces_to == "mueller"
     image = MuellerImage.load(Reduction(path).make())
-    assert image.seen.reshape(4, 4).tolist() == [[True, False, False, False]] * 4
+    assert image.is_determined.reshape(4, 4).tolist() == [[True, False, False, False]] * 4
     s = image.values.mean(axis=(2, 3))[:, 0]
     np.testing.assert_allclose(s / s[0], light, atol=1e-3)
 

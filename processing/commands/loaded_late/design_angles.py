@@ -83,8 +83,8 @@ def _show(model: InstrumentModel, states: int, best: FreeDesign) -> None:
 def _show_present(model: InstrumentModel, noise: AssumedNoise, now: StateTable, with_plates: bool) -> None:
     basis, intensities = determined_basis(model), len(now) * len(model.channels)
     result = score(model.rows(now.angles_deg), noise, basis, bound_of(model, intensities))
-    is_whole = result.rank == result.wanted
-    variance = f"{result.equally_weighted_variance:.4f}" if is_whole else f"rank {result.rank} of {result.wanted}"
+    is_whole = result.rank == result.full_rank
+    variance = f"{result.equally_weighted_variance:.4f}" if is_whole else f"rank {result.rank} of {result.full_rank}"
     change = "the table, and plates of these retardances" if with_plates else "the table alone"
     typer.echo(f"  the table as it is, {len(now)} states: {variance}; to change at the bench: {change}")
 

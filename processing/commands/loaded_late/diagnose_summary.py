@@ -45,7 +45,7 @@ def show(d: Diagnosis, details: bool = False, written: bool = False) -> None:
     _say(short, f"{head}{d.instrument}: {VERDICTS[d.verdict]}{', not corrected' if refused else ''}")
     noise = "" if d.noise_floor_percent is None else f"; noise {d.noise_floor_percent:.3g} %"
     kind = "residual" if d.noise_floor_percent is None else "residual beyond noise"
-    _say(short, f"{kind} {d.error_before.told_beside(d.error_after)} of the mean signal{noise}")
+    _say(short, f"{kind} {d.error_before.text_change(d.error_after)} of the mean signal{noise}")
     for c in d.captures:
         _name_capture(short, c)
     for head, text in (("first of all", d.wiring), ("not determined", d.branch)):
@@ -54,7 +54,7 @@ def show(d: Diagnosis, details: bool = False, written: bool = False) -> None:
     for line in d.noise.told if d.noise is not None else ():
         _say(short, f"the noise is not what is declared: {line}")
     for left_out in d.left_out:
-        _say(short, f"left out of {left_out.capture}: {left_out.told}")
+        _say(short, f"left out of {left_out.capture}: {left_out.text}")
     for number, effect in enumerate(d.effects, 1):
         _show_effect(short, number, effect, noise)
     _show_uncertainty(d, written)
@@ -89,12 +89,12 @@ def _show_effect(short: Mapping[str, str], number: int, effect: FoundEffect, noi
     where += f" at {effect.wavelength_nm:g} nm" if effect.wavelength_nm is not None else ""
     where += f" in {effect.capture}" if effect.capture and short else ""
     values = ", ".join(
-        f"{name} {p.told}{'' if p.unit == '1' else f' {p.unit}'}{f' ({p.note})' if p.note else ''}"
+        f"{name} {p.text}{'' if p.unit == '1' else f' {p.unit}'}{f' ({p.note})' if p.note else ''}"
         for name, p in effect.parameters.items()
     )
     _say(short, f"{number}. {effect.kind}{where} ({_answer(effect)}): {values}")
     if effect.residual_without is not None and effect.residual_with is not None:
-        _say(short, f"   residual without it {effect.residual_without.told_beside(effect.residual_with)}{noise}")
+        _say(short, f"   residual without it {effect.residual_without.text_change(effect.residual_with)}{noise}")
     _say(short, f"   not applied, because {effect.not_applied}" if effect.not_applied else "   applied")
 
 
@@ -117,7 +117,7 @@ def _name_capture(short: Mapping[str, str], c: CaptureReport) -> None:
     label = short.get(c.name, "capture")
     line = f"  {label}  {c.name}" + (f", {c.wavelength_nm:g} nm" if c.wavelength_nm else "")
     if short and c.error_before is not None and c.error_after is not None:
-        line += f": {c.error_before.told_beside(c.error_after)}"
+        line += f": {c.error_before.text_change(c.error_after)}"
     if c.source_percent is not None:
         line += f"; level of the source projected out, it varies by {c.source_percent:.2g} %"
     typer.echo(line)
@@ -131,7 +131,7 @@ def _show_uncertainty(d: Diagnosis, written: bool) -> None:
     if correction is None:
         return
     if correction.mueller is not None:
-        typer.echo(f"{correction.mueller.told}")
+        typer.echo(f"{correction.mueller.text}")
     if correction.refused is not None and not any(e.not_applied for e in d.effects):
         subject = "but for the fitted train, nothing" if d.corrects else "nothing"
         typer.echo(f"{subject} is applied, because {correction.refused}")

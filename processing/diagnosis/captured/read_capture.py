@@ -180,7 +180,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     states = sample_states(capture)
     angles_of(capture, model, states)
     correction = CountCorrection.of(capture)
-    frames = read_frames(capture, capture.seen(model), states, correction)
+    frames = read_frames(capture, capture.adapt(model), states, correction)
     raw, side = frames.counts, frames.side
     cut_off = frames.zero_share > MOST_CUT_OFF
     if cut_off.all():
@@ -211,7 +211,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         wavelength_nm=capture.header.wavelength_nm,
         binned=side,
         pitch=model.pitch * side,
-        place_px=_places_px(capture.seen(model), side),
+        place_px=_places_px(capture.adapt(model), side),
         rounding=frames.rounding / top**2,
         cut_off=tuple(np.flatnonzero(cut_off).tolist()),
     )

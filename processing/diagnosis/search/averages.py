@@ -106,7 +106,7 @@ def sample(sets: Sets, state: State, visits: int, seed: int = 0) -> Samples:
         is_included = random.random() < 0.5
         state.tau[k] = sets.taus[int(random.choice(sets.taus.size, p=c.tau_weights[k]))] if is_included else 0.0
     # Where what is left is the noise, a set that leaves less has a smaller unit, and must be passed to step by step.
-    for alternative in swap_groups(sets, average.best) if sets.noise.known else ():
+    for alternative in swap_groups(sets, average.best) if sets.noise.is_known else ():
         c = sets.conditional(alternative)
         average.add(c, alternative, chance_of(sets, c))
     return average.samples()

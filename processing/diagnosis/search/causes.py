@@ -42,7 +42,7 @@ class Cause:
     alternatives: tuple[Candidate, ...]
 
     @property
-    def others(self) -> tuple[Candidate, ...]:
+    def other_effects(self) -> tuple[Candidate, ...]:
         """Alternatives that are another effect, not the same from another state on."""
         return tuple(c for c in self.alternatives if c.family != self.candidates[0].family)
 

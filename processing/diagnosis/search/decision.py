@@ -111,7 +111,7 @@ def chance_checks(quantity: str, change: PredictedChange) -> tuple[Check, Check]
 
 def refusal(figures: tuple[Check, ...]) -> str | None:
     """Why a correction is not written, in words; None if every figure holds."""
-    worse = [c.told for c in figures if not c.holds]
+    worse = [c.text for c in figures if not c.holds]
     return "; ".join(worse) if worse else None
 
 

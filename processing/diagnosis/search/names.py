@@ -37,7 +37,7 @@ class Names:
     @property
     def rivals(self) -> list[tuple[Candidate, ...]]:
         """Sets of effects of which one is there."""
-        return [(c.candidates[0], *c.others) for c in self.named if c.others]
+        return [(c.candidates[0], *c.other_effects) for c in self.named if c.other_effects]
 
 
 def with_parts(

@@ -102,7 +102,7 @@ def fit_posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], st
     members, groups = group_candidates(space, fixed)
     about, sets, state, rivals = _expand(problem, space, fixed, members, groups=groups, start=start)
     # Where what is left is the noise, each set has a unit of its own, and counts by its evidence.
-    samples = stay(sets, state, CHANGES) if sets.noise.known else sample(sets, state, SAMPLES)
+    samples = stay(sets, state, CHANGES) if sets.noise.is_known else sample(sets, state, SAMPLES)
     labels = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(labels) or 'nothing'}; unit of chi-square {state.unit:.3g}")
     return _posterior_of(problem, space, members, sets, samples=samples, about=about, rivals=rivals)

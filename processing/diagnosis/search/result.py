@@ -38,9 +38,9 @@ class BeyondNoise(Section):
 
         Examples
         --------
-        >>> BeyondNoise.of(excess=18_000, freedom=1_000_000, noise_percent=1.25).told
+        >>> BeyondNoise.of(excess=18_000, freedom=1_000_000, noise_percent=1.25).text
         '0.168 ± 0.007 %'
-        >>> BeyondNoise.of(excess=900, freedom=1_000_000, noise_percent=1.25).told
+        >>> BeyondNoise.of(excess=900, freedom=1_000_000, noise_percent=1.25).text
         'under 0.08 %'
         """
         share, error = max(excess / freedom, 0.0), (2 / freedom) ** 0.5
@@ -53,7 +53,7 @@ class BeyondNoise(Section):
         )
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         """With its error, or below which it is where noise alone could be as large."""
         return _percent(self.percent, self.stderr) if self.resolved else f"under {self.most:.1g} %"
 
@@ -68,7 +68,7 @@ class BeyondNoise(Section):
         Examples
         --------
         >>> before, after = (BeyondNoise.of(x, freedom=1_000_000, noise_percent=2.5) for x in (2000, -100))
-        >>> before.told, before.explained(after)
+        >>> before.text, before.explained(after)
         ('under 0.2 %', '0.115 ± 0.003 %')
         """
         square = self.mean_square - after.mean_square
@@ -93,9 +93,9 @@ class Error(Section):
     beyond_noise: BeyondNoise | None = None
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         """The residual beyond noise, or all of it where the noise is not known."""
-        return f"{self.rms_percent:.3g} %" if self.beyond_noise is None else self.beyond_noise.told
+        return f"{self.rms_percent:.3g} %" if self.beyond_noise is None else self.beyond_noise.text
 
     def explained(self, after: Error) -> str | None:
         """What a correction explains that leaves `after`, where this residual is lost in noise; otherwise None."""
@@ -103,12 +103,12 @@ class Error(Section):
             return None
         return self.beyond_noise.explained(after.beyond_noise)
 
-    def told_beside(self, after: Error) -> str:
+    def text_change(self, after: Error) -> str:
         """This residual and the one `after` a correction, or how much of this one is explained."""
         if after == self:
-            return self.told
+            return self.text
         explained = self.explained(after)
-        return f"{self.told} -> {after.told}" if explained is None else f"{self.told} ({explained} explained)"
+        return f"{self.text} -> {after.text}" if explained is None else f"{self.text} ({explained} explained)"
 
 
 class FoundEffect(Section):
@@ -177,7 +177,7 @@ class Check(Section):
     is_chance: bool = False
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         """Why it refuses a correction."""
         if self.is_chance:
             return f"{self.name}: {100 * self.after:.2g} %, where {100 * CHANCE_WORSE:g} % is the limit"
@@ -223,7 +223,7 @@ class MuellerError(Section):
     most: str
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         """In words."""
         largest = max(range(len(self.elements)), key=lambda k: self.elements[k])
         row, column = divmod(largest, 4)
@@ -300,7 +300,7 @@ class NotMeasured(Section):
     pitch: int = 1
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         """In words."""
         parts = []
         if self.states:

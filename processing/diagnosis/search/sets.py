@@ -78,20 +78,20 @@ class Noise:
 
     Attributes
     ----------
-    known : the noise is known, so the unit is at least one; else all that is left is noise.
+    is_known : the noise is known, so the unit is at least one; else all that is left is noise.
     directions : independent directions over which structure spreads; of unknown noise, the degrees of freedom.
     slack : excess up to which nothing but noise is left.
     floor : least unit.
     """
 
-    known: bool
+    is_known: bool
     directions: float
     slack: float = 0.0
     floor: float = 1.0
 
     def units(self, excess: Array) -> Array:
         """Most likely unit where a fit has an `excess`, the cost of the prior included."""
-        beyond = self.directions + np.maximum(excess - self.slack, 0.0) if self.known else excess
+        beyond = self.directions + np.maximum(excess - self.slack, 0.0) if self.is_known else excess
         return np.maximum(beyond / self.directions, self.floor)
 
     def unit(self, excess: float) -> float:
@@ -101,7 +101,7 @@ class Noise:
     def log_likelihoods(self, excess: Array) -> Array:
         """Log of the likelihood with the most likely unit."""
         spread, within = excess, np.zeros(())
-        if self.known:
+        if self.is_known:
             # Within the noise differences count in full.
             spread = self.directions + np.maximum(excess - self.slack, 0.0)
             within = np.minimum(excess - self.slack, 0.0)
@@ -167,7 +167,7 @@ class Sets:
         self.count = float(np.sum(np.exp(-self.price[self.free]) / self.share[self.free])) if count is None else count
         self.taus = TAU
         # Where what is left is the noise, what fits better would be taken for a smaller one.
-        self.many = np.array([g.index.size >= MANY and noise.known for g in groups], dtype=bool)
+        self.many = np.array([g.index.size >= MANY and noise.is_known for g in groups], dtype=bool)
         self.tau_weight = np.where(self.many[:, None], TAU_WEIGHT_OF_MANY, TAU_WEIGHT)
         sizes = np.array([g.index.size for g in groups])
         self._alike = [np.flatnonzero((sizes == n) & self.free) for n in np.unique(sizes)]

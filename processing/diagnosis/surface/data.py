@@ -104,7 +104,7 @@ def read_surface(
             f"{capture.path}: a capture without mosaic, and the instrument {model.name!r} has one. Captures of two "
             "instruments are diagnosed one after the other, each with its own instrument file."
         )
-    model = capture.seen(model)
+    model = capture.adapt(model)
     data, omega = read_capture(capture, model), capture.header.omega_deg
     if omega is None:
         raise ProcessError(f"{capture.path}: the capture does not say its arm angle; import it with --omega-deg.")

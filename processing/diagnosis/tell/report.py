@@ -53,7 +53,7 @@ def _errors(d: Diagnosis) -> list[list[str]]:
     return [
         ["", kind, "rms of single intensities", "chi2 / dof"],
         *(
-            [when, error.told, f"{error.rms_percent:.4f} %", f"{error.chi2_reduced:.4f}"]
+            [when, error.text, f"{error.rms_percent:.4f} %", f"{error.chi2_reduced:.4f}"]
             for when, error in (("before", d.error_before), ("after", d.error_after))
         ),
         ["noise", "", floor, "1"],
@@ -75,7 +75,7 @@ def _effects(d: Diagnosis) -> list[list[str]]:
             cells = (kind, place, sure, f"{e.evidence:.0f}", ", ".join(e.could_be))
             first = cells if name == next(iter(e.parameters)) else ("",) * len(cells)
             # Non-breaking spaces: a number stays on one line with its error and unit.
-            value = f"{p.told} {p.unit if p.unit != '1' else ''}".strip().replace(" ", "\u00a0")
+            value = f"{p.text} {p.unit if p.unit != '1' else ''}".strip().replace(" ", "\u00a0")
             rows.append([*first[:2], name, value, *first[2:]])
     head = ["effect", "of", "parameter", "value", "name", "chi2 explained", "or it is"]
     return [head, *rows] if rows else []

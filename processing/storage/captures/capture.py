@@ -186,7 +186,7 @@ class Capture(OpenH5):
         targets = {axis: angles[self.done][light] for axis, angles in self.planned_targets_deg().items()}
         return {axis: span for axis, angles in targets.items() if angles.size and (span := float(np.ptp(angles))) > 0}
 
-    def seen(self, model: InstrumentModel) -> InstrumentModel:
+    def adapt(self, model: InstrumentModel) -> InstrumentModel:
         """The model with the mosaic as this capture's frames have it: an odd offset of the region shifts it."""
         if model.mosaic is None or self.header.mosaic is None:
             return model

@@ -111,7 +111,7 @@ class MuellerImage:
         return np.moveaxis(self.values, (0, 1), (-2, -1))
 
     @property
-    def seen(self) -> BoolArray:
+    def is_determined(self) -> BoolArray:
         """(16,) True for the elements that are determined."""
         return seen_elements(self.facts)
 
@@ -193,7 +193,7 @@ class MuellerImage:
             full = (variance.T @ (drive[:, None] * drive).reshape(256, -1).T).reshape(-1, 16, 16)
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = self.errors.reshape(16, -1).T / np.sqrt(np.einsum("pii->pi", full))
-        scale[:, ~self.seen] = 0.0
+        scale[:, ~self.is_determined] = 0.0
         full *= scale[:, :, None]
         full *= scale[:, None, :]
         return full.reshape(*self.mask.shape, 16, 16)
@@ -226,7 +226,7 @@ class MuellerImage:
         drive, variance = self._sources
         response = drive.T @ g.T.astype(np.float32)
         total = np.einsum("np,np,np->p", response, response, variance)
-        return np.asarray((total * self._told).reshape(self.mask.shape))
+        return np.asarray((total * self._error_ratio).reshape(self.mask.shape))
 
     def covariance_with(self, gradient: NDArray[np.floating]) -> NDArray[np.float64]:
         """Covariance (rows, columns, 16) of the elements with a quantity of gradient (rows, columns, 16)."""
@@ -235,7 +235,7 @@ class MuellerImage:
             return np.asarray((self._covariance.reshape(-1, 16, 16) @ g[:, :, None]).reshape(gradient.shape))
         drive, variance = self._sources
         covariance = drive @ (variance * (drive.T @ g.T.astype(np.float32)))
-        return np.asarray((covariance * self._told).T.reshape(gradient.shape), dtype=float)
+        return np.asarray((covariance * self._error_ratio).T.reshape(gradient.shape), dtype=float)
 
     def covariances_between(self, pairs: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
         """Covariances (pairs, pixels) of elements, given by their numbers in row-major order; counts^2."""
@@ -243,7 +243,7 @@ class MuellerImage:
         if self.facts["weighted"]:
             return np.asarray(self._covariance.reshape(-1, 16, 16)[:, first, second].T)
         drive, variance = self._sources
-        return np.asarray((drive[first] * drive[second]) @ variance * self._told)
+        return np.asarray((drive[first] * drive[second]) @ variance * self._error_ratio)
 
     def product_of(self, form: NDArray[np.float64], gradient: NDArray[np.floating]) -> NDArray[np.float64]:
         """Sum over elements a, b, k of covariance[a, b] form[a, b, k] gradient[k]: (rows, columns).
@@ -260,7 +260,7 @@ class MuellerImage:
         drive, variance = self._sources
         each = np.einsum("an,bn,abk->nk", drive, drive, form, optimize=True)
         total = np.einsum("np,np->p", each.astype(np.float32) @ g.T.astype(np.float32), variance)
-        return np.asarray((total * self._told).reshape(self.mask.shape))
+        return np.asarray((total * self._error_ratio).reshape(self.mask.shape))
 
     def drawn_noise(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """One draw (16, pixels) of the noise of the elements, counts, with their covariance."""
@@ -269,18 +269,18 @@ class MuellerImage:
             return np.asarray(np.einsum("pij,jp->ip", factor, rng.normal(size=(16, len(factor)))))
         drive, variance = self._sources
         noise = drive @ (np.sqrt(variance) * rng.normal(size=variance.shape))
-        return np.asarray(noise * np.sqrt(self._told))
+        return np.asarray(noise * np.sqrt(self._error_ratio))
 
     @property
     def told_variance(self) -> NDArray[np.float64]:
         """`intensity_variance` (N, pixels) with what dark frames and left-out states add, as the errors hold it."""
         common = np.square(self.w @ self.dark).sum(axis=1)[:, None]
-        return np.asarray((self.intensity_variance + common) * self._told)
+        return np.asarray((self.intensity_variance + common) * self._error_ratio)
 
     @cached_property
-    def _told(self) -> NDArray[np.float64]:
+    def _error_ratio(self) -> NDArray[np.float64]:
         # Flats and left-out states change all errors of a pixel much alike.
-        valid = self.seen
+        valid = self.is_determined
         if not valid.any():
             return np.ones(self.mask.size)
         drive, variance = self._sources
