@@ -93,7 +93,7 @@ def parse_yaml(text: str, model: type[Model], source: str = "text") -> Model:
     try:
         value = model.model_validate(_plain(tree))
     except ValidationError as error:
-        lines = _described(source, tree, model, mistakes_of(error))
+        lines = _describe(source, tree, model, mistakes_of(error))
         places = {line.split(" ", 1)[0] for line in lines}
         more = [line for line in _not_finite(source, tree, _scalars(tree)) if line.split(" ", 1)[0] not in places]
         raise _refusal(source, lines + more) from error
@@ -159,7 +159,7 @@ def _tree(text: str, source: str) -> CommentedMap:
     if len(text) > MOST_BYTES:
         raise ConfigError(f"{source}: {len(text):,} characters; at most {MOST_BYTES:,} are read")
     try:
-        tree = _parsed(text)
+        tree = _parse(text)
     except MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else "?"
         problem = "a tab; YAML is indented with spaces" if "'\\t'" in str(error.problem) else one_line(error.problem)
@@ -173,7 +173,7 @@ def _tree(text: str, source: str) -> CommentedMap:
 
 
 @functools.lru_cache(maxsize=64)
-def _parsed(text: str) -> Any:
+def _parse(text: str) -> Any:
     """The tree of a text, which nobody changes: a campaign reads its few files at every capture."""
     yaml = YAML(typ="rt")
     yaml.Composer = _BoundedComposer
@@ -252,7 +252,7 @@ def _plain(node: Any) -> Any:
     return node
 
 
-def _described(source: str, tree: CommentedMap, model: type[BaseModel], entries: Sequence[Any]) -> list[str]:
+def _describe(source: str, tree: CommentedMap, model: type[BaseModel], entries: Sequence[Any]) -> list[str]:
     """A line for each place with a mistake; for a file of another kind only that."""
     kind = [entry for entry in entries if entry["loc"] == ("kind",)]
     names = names_in(model) if any(entry["type"] == "extra_forbidden" for entry in entries) else ()

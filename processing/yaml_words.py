@@ -104,16 +104,16 @@ def words_of(entry: Any, names: Sequence[str] = ()) -> str:
         elsewhere = "; another section may have it" if key in names else ""
         return WORDS[kind] + (f"; is {meant[0]!r} meant?" if meant else elsewhere)
     if kind == "string_pattern_mismatch" and entry["ctx"]["pattern"] == NAME_PATTERN:
-        return "may have letters, digits, - and _ only" + _found(kind, entry)
+        return "may have letters, digits, - and _ only" + _value_text(kind, entry)
     if kind in WORDS:
-        return WORDS[kind].format_map(entry.get("ctx", {})) + _found(kind, entry)
+        return WORDS[kind].format_map(entry.get("ctx", {})) + _value_text(kind, entry)
     stem, _, rest = kind.partition("_")
     if stem in TYPES and rest in ("type", "parsing", "parsing_size", "attributes_type"):
-        return f"must be {TYPES[stem]}" + _found(kind, entry)
+        return f"must be {TYPES[stem]}" + _value_text(kind, entry)
     return str(entry["msg"]).removeprefix("Value error, ")
 
 
-def _found(kind: str, entry: Any) -> str:
+def _value_text(kind: str, entry: Any) -> str:
     """The value itself, where it is short and not told already."""
     value = entry.get("input")
     if kind in NEEDS_NO_VALUE or isinstance(value, dict | list | tuple):

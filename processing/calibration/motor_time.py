@@ -135,7 +135,7 @@ def front(
     for weight in WEIGHTS:
         if weight:
             x = np.concatenate([np.deg2rad(angles).reshape(-1), retardances])
-            solved = minimize(_both(cost, rates, weight), x, jac=True, method="L-BFGS-B", options={"maxiter": 300})
+            solved = minimize(_timed(cost, rates, weight), x, jac=True, method="L-BFGS-B", options={"maxiter": 300})
             moved, retardances = cost.split(np.asarray(solved.x))
             angles = ordered(np.rad2deg(moved), turn, rates)
         design = design_of(model, cost, np.concatenate([np.deg2rad(angles).reshape(-1), retardances]), best.bound)
@@ -144,7 +144,7 @@ def front(
     return [p for k, p in enumerate(points) if all(p.seconds < q.seconds for q in points[:k])]
 
 
-def _both(cost: Cost, speeds: Sequence[Speed], weight: float) -> Callable[[Array], tuple[float, Array]]:
+def _timed(cost: Cost, speeds: Sequence[Speed], weight: float) -> Callable[[Array], tuple[float, Array]]:
     pace = np.array([[s.deg_s] for s in speeds])
 
     def value(x: Array) -> tuple[float, Array]:

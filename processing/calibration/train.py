@@ -108,7 +108,7 @@ class CurveFit:
         """
         matrix = self.shared.matrix(wavelength_nm)
         nominal = model.model_copy(update={"calibrate": self.shared.names, "wavelengths_nm": None})
-        return _fitted(
+        return _fit_values(
             self.shared, nominal.nominal_at(wavelength_nm), matrix, self.searched, covariance=self.covariance
         )
 
@@ -234,7 +234,7 @@ class _Fit:
         minimum = search(start)
         if self.rms(minimum.x) > POOR_FIT:
             # Azimuths have several valleys; a residual like this is the bottom of a wrong one.
-            minimum = min([minimum, *(search(x0) for x0 in self._other_starts(start))], key=lambda f: float(f.cost))
+            minimum = min([minimum, *(search(x0) for x0 in self._azimuth_starts(start))], key=lambda f: float(f.cost))
         if not minimum.success:
             raise NotDetermined(
                 f"the fit did not converge ({minimum.message}); start from an instrument file closer to the truth"
@@ -286,7 +286,7 @@ class _Fit:
         covariance = self.covariance(minimum)
         out = []
         for part, matrix in zip(self.parts, self._matrices, strict=True):
-            fitted = _fitted(self.shared, part.model, matrix, minimum.x, covariance=covariance)
+            fitted = _fit_values(self.shared, part.model, matrix, minimum.x, covariance=covariance)
             residual = part.residual(fitted.model)
             out.append(
                 Calibration(
@@ -307,7 +307,7 @@ class _Fit:
 
         return np.asarray(approx_fprime(values, residual, small))
 
-    def _other_starts(self, start: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    def _azimuth_starts(self, start: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         azimuths = [
             k for k, u in enumerate(self.shared.unknown) if u.name.endswith(".azimuth_deg") and u.term in (None, 0)
         ][:MOST_TURNED]
@@ -320,7 +320,7 @@ class _Fit:
         return starts
 
 
-def _fitted(
+def _fit_values(
     shared: TrainValues,
     model: InstrumentModel,
     matrix: NDArray[np.float64],

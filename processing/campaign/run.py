@@ -132,7 +132,7 @@ class ProcessedCampaign:
         flats = flats_of(self.folder, captures)
         tasks = [self._task(capture.path, capture.kind, flats.get(capture.path)) for capture in captures]
         if self.register:
-            tasks = _registered(tasks, pool)
+            tasks = _register(tasks, pool)
         views = {task.kind: task_view(task) for task in tasks}
         results = gather(pool, measure, tasks, progress)
         measures = [result for result in results if isinstance(result, CaptureMeasure)]
@@ -157,7 +157,7 @@ class ProcessedCampaign:
         )
 
 
-def _registered(tasks: Sequence[CaptureTask], pool: Executor) -> list[CaptureTask]:
+def _register(tasks: Sequence[CaptureTask], pool: Executor) -> list[CaptureTask]:
     # Camera and sphere stand still while the arm turns: each instrument takes its best image, mostly a side view.
     best: dict[str, tuple[float, str]] = {}
     for task, outline in zip(tasks, gather(pool, locate, tasks), strict=True):

@@ -81,7 +81,7 @@ def campaign_command(
         _show_comparison(result, folder.name, target, with_paper)
         left_out, failed = result.left_out, result.failed
     else:
-        corrected = _corrected(folder, target) if correct else {}
+        corrected = _instruments_by_capture(folder, target) if correct else {}
         curves = Curves(folder, target, region, instrument, corrected, *selection)
         with executor(workers, scheduler) as pool, progress_bar("campaign", "captures") as tick:
             results, simulated, omitted = curves.run(pool, tick)
@@ -149,7 +149,7 @@ def _show_means(
     typer.echo(str(target / "means.png"))
 
 
-def _corrected(folder: Path, target: Path) -> dict[Path, Path]:
+def _instruments_by_capture(folder: Path, target: Path) -> dict[Path, Path]:
     """Instrument file of each capture whose instrument has captures of air in the folder: `diagnose` of these.
 
     A file that was made of the same captures of air is used again.

@@ -92,12 +92,12 @@ class Application(typer.Typer):
         try:
             ended = self._command(*args, standalone_mode=False, **kwargs)
         except TyperException as error:
-            typer.echo(_in_our_words(error), err=True)
+            typer.echo(_error_text(error), err=True)
             sys.exit(error.exit_code)
         sys.exit(ended if isinstance(ended, int) else 0)
 
 
-def _in_our_words(error: TyperException) -> str:
+def _error_text(error: TyperException) -> str:
     text, context = error.format_message().rstrip("."), getattr(error, "ctx", None)
     if text.startswith("Usage:"):
         # A command without arguments: its help is the answer.

@@ -92,9 +92,9 @@ def design_command(
         now = {n: _present(model, n, ratio, step, table=table) for n in counts}
         chosen = optimize_angles(model, noise, now, optimize, speeds=speed or (), weighted=weighted, jitter_deg=jitter)
     elif optimize is not None:
-        chosen = _optimized(model, noise, counts, optimize, ratio=ratio)
+        chosen = _optimize(model, noise, counts, optimize, ratio=ratio)
     else:
-        chosen = _given(model, counts, ratio, step, table=table)
+        chosen = _one_table(model, counts, ratio, step, table=table)
         w = model.rows(chosen.angles_deg, changes_at(model, chosen.angles_deg))
         intensities = len(chosen) * len(model.channels)
         result = score(w, noise, determined_basis(model), bound_of(model, intensities))
@@ -128,14 +128,14 @@ def _present(
     from processing.errors import ProcessError
 
     try:
-        return _given(model, [count], ratio, step, table=table)
+        return _one_table(model, [count], ratio, step, table=table)
     except ProcessError:
         if table is not None:
             raise
         return None
 
 
-def _given(
+def _one_table(
     model: InstrumentModel, counts: list[int], ratio: float, step: float | None, *, table: Path | None
 ) -> StateTable:
     import numpy as np
@@ -162,9 +162,7 @@ def _given(
     return rotating_retarders(1.0, counts[0], step if step is not None else 360 / counts[0], ratio, axes=axes)
 
 
-def _optimized(
-    model: InstrumentModel, noise: AssumedNoise, counts: list[int], free: str, *, ratio: float
-) -> StateTable:
+def _optimize(model: InstrumentModel, noise: AssumedNoise, counts: list[int], free: str, *, ratio: float) -> StateTable:
     from processing.calibration.state_design import optimize, two_retarders
     from processing.commands.progress_bar import progress_bar
     from processing.errors import ProcessError

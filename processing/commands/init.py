@@ -77,7 +77,7 @@ def ask(prompt: Callable[..., str]) -> str:
         "# Made by `process init`. Angles are in degrees, counterclockwise from +x for an observer who looks into the",
         "# beam; the azimuth of a retarder is that of its fast axis. docs/instrument-files.md lists all fields.",
         "kind: instrument",
-        f"name: {_quoted(name)}",
+        f"name: {_quote(name)}",
         f"wavelengths_nm: [{', '.join(f'{value:g}' for value in nm)}]",
         "# Elements between source and sample, in the order of the light.",
         *_elements("generator", generator, "psg", generator_deg, turning=psg),
@@ -109,7 +109,7 @@ def _turning(prompt: Callable[..., str], number: int, axis: str, kind: str) -> _
 
 
 def _elements(side: str, kind: str, short: str, polarizer_deg: float, *, turning: _Turning) -> list[str]:
-    axis = f", axis: {_quoted(turning.axis)}" if turning.axis else ""
+    axis = f", axis: {_quote(turning.axis)}" if turning.axis else ""
     retarder = f"  - {{kind: retarder, name: {short}_retarder{axis}, azimuth_deg: 0, retardance_deg: "
     retarder += f"{turning.retardance_deg or 0:g}}}"
     polarizer_axis = axis if "retarder" not in kind else ""
@@ -141,7 +141,7 @@ def _numbers(prompt: Callable[..., str], question: str, default: str) -> list[fl
             typer.echo(f"{answer!r} is no number.")
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     import json
 
     return json.dumps(text)

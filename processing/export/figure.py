@@ -34,7 +34,7 @@ def write_figure(source: Path, path: Path, planes: Sequence[str]) -> None:
         if not planes or (list(planes) == ["mueller"] and product.kind == "mueller"):
             figure = product_figure(product)
         else:
-            is_known = _known(product)
+            is_known = _valid_pixels(product)
             panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = []
             for name in planes:
                 values = product.get(name)
@@ -51,7 +51,7 @@ def write_figure(source: Path, path: Path, planes: Sequence[str]) -> None:
         figure.savefig(new, dpi=FIGURE_DPI, metadata={"CreationDate": None} if path.suffix == ".pdf" else None)
 
 
-def _known(product: Product) -> NDArray[np.bool_]:
+def _valid_pixels(product: Product) -> NDArray[np.bool_]:
     """Where a product's own mask says that its values mean something; everywhere without one."""
     mask = np.ones(product.shape, dtype=bool)
     for name in MASKS:

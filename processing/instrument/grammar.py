@@ -148,7 +148,7 @@ class Sentence:
             _add(changes, model, self.site, quantity, part=part)
 
 
-def parsed(text: str) -> Sentence:
+def parse_sentence(text: str) -> Sentence:
     """The sentence of a text.
 
     Raises

@@ -100,7 +100,7 @@ def fit_products(
     ]
     fit_of = fit_plastic if kind == "rough_plastic" else partial(fit_values, correlation=correlation)
     fit = fit_of(
-        _joined([data.points for data in each]),
+        _join([data.points for data in each]),
         np.concatenate([data.values for data in each], axis=1),
         first.rows,
         np.concatenate([data.covariance for data in each]),
@@ -191,6 +191,6 @@ def _sample(view: ViewingGeometry, product: Product) -> tuple[ScatteringGeometry
     return image.points[chosen], np.flatnonzero(image.mask)[chosen]
 
 
-def _joined(parts: Sequence[ScatteringGeometry]) -> ScatteringGeometry:
+def _join(parts: Sequence[ScatteringGeometry]) -> ScatteringGeometry:
     vectors = (np.concatenate([getattr(p, name) for p in parts]) for name in ("normal", "to_source", "to_camera"))
     return ScatteringGeometry(*vectors)

@@ -146,7 +146,7 @@ def mean_of(sources: Sequence[Path], region: Region) -> list[MeanValue]:
                 f"{source} and {sources[0]} are not of one kind and wavelength, or one of them is simulated, or states "
                 "no uncertainty of its instrument. Give those that belong together."
             )
-    together = _together(means)
+    together = _combine(means)
     each = [mean.numbers() for mean in means] if len(means) > 1 else []
     return [_value(name, n, [e[name].value for e in each], together.inputs) for name, n in together.numbers().items()]
 
@@ -260,7 +260,7 @@ def _stokes_mean(image: StokesImage, columns: slice, correlation_s0: Array, sour
     )
 
 
-def _together(means: Sequence[_Mean]) -> _Mean:
+def _combine(means: Sequence[_Mean]) -> _Mean:
     """The mean of several captures; what one instrument does to all of its own does not average.
 
     Each counts alike, whatever its light: they are scaled to one m00 or S0.

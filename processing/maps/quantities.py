@@ -137,7 +137,7 @@ def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
             lambda writer: light_facts(writer, product, light) | inputs,
         )
     maps = planes_of(extra, pairs)
-    partial = _determined(product, extra, pairs)
+    partial = _partial_maps(product, extra, pairs)
 
     def block(rows: slice) -> dict[str, NDArray[Any]]:
         image = image_of(product, rows)
@@ -166,7 +166,7 @@ def require_decompositions(extra: Sequence[str]) -> None:
         raise ProcessError(f"unknown decomposition {unknown[0]!r}; there are: {', '.join(EXTRA)}")
 
 
-def _determined(product: Product, extra: Sequence[str], pairs: Pairs) -> list[str]:
+def _partial_maps(product: Product, extra: Sequence[str], pairs: Pairs) -> list[str]:
     """The maps that a partial polarimeter determines; empty for whole matrices.
 
     Raises

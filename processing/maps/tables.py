@@ -71,7 +71,7 @@ def _add_mueller(
     block = MuellerImage.of(product, rows).at(np.flatnonzero(image.mask))
     left, right = (np.ascontiguousarray(np.moveaxis(m, 0, -1)) for m in frame_turns(image.points, image.points.half))
     factor = np.ones(left.shape[-1]) if white is None else white.factor(product, image)
-    values = factor * _turned(block.values.reshape(16, -1), _shares(left, right))
+    values = factor * _turn(block.values.reshape(16, -1), _shares(left, right))
     if table.has_noise:
         values[:, ~np.isfinite(block.errors.reshape(16, -1).sum(axis=0))] = np.nan
 
@@ -79,10 +79,10 @@ def _add_mueller(
         pixels, turns = block.averaged(groups.mean), _shares(groups.mean(left), groups.mean(right))
         scale = groups.mean(factor)
         if table.has_noise:
-            yield np.square(scale) * _turned_variance(pixels, turns)
+            yield np.square(scale) * _turn_variance(pixels, turns)
         if table.inputs and (systematic := Systematic.of_product(product)) is not None:
             for moved in systematic.moves(pixels.values.reshape(16, -1)):
-                yield scale * _turned(moved, turns)
+                yield scale * _turn(moved, turns)
         if white is not None:
             yield white.u * groups.mean(values)
 
@@ -94,7 +94,7 @@ def _shares(left: Array, right: Array) -> dict[tuple[int, int], Array]:
     return {(k, i): left[k // 4, i // 4] * right[i % 4, k % 4] for g in _MIXED for k in g for i in g}
 
 
-def _turned(values: NDArray[np.floating], share: Mapping[tuple[int, int], Array]) -> Array:
+def _turn(values: NDArray[np.floating], share: Mapping[tuple[int, int], Array]) -> Array:
     """Elements (16, N) in turned axes."""
     elements = np.zeros(values.shape)
     for (k, i), part in share.items():
@@ -102,7 +102,7 @@ def _turned(values: NDArray[np.floating], share: Mapping[tuple[int, int], Array]
     return elements
 
 
-def _turned_variance(image: MuellerImage, share: Mapping[tuple[int, int], Array]) -> Array:
+def _turn_variance(image: MuellerImage, share: Mapping[tuple[int, int], Array]) -> Array:
     """Variance (16, N) of the elements in turned axes."""
     pairs = [pair for group in _MIXED for pair in combinations_with_replacement(group, 2)]
     variance = np.zeros((16, image.mask.size))

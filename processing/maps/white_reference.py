@@ -100,7 +100,7 @@ class WhiteReference(NamedTuple):
                 raise ProcessError(f"{plaque}: no good pixel sees the plaque. Check {geometry_file}.")
             m00 = product.get("mueller")[0, 0][image.mask][good].astype(float)
             noise = product.get("mueller_errors")[0, 0][image.mask][good].astype(float)
-            alike = _alike(product)
+            alike = _conditions(product)
         points = image.points[good]
         cosines = dot(points.normal, points.to_source), dot(points.normal, points.to_camera)
         for name, cosine in zip(("incidence_deg", "viewing_deg"), cosines, strict=True):
@@ -124,7 +124,7 @@ class WhiteReference(NamedTuple):
         ProcessError : the product was not taken and reduced like the plaque, or does not know its exposure.
         """
         names = ("wavelength", "detector", "flat field", "origin (simulated or measured)")
-        differ = [n for n, a, b in zip(names, self.alike, _alike(product), strict=True) if a != b]
+        differ = [n for n, a, b in zip(names, self.alike, _conditions(product), strict=True) if a != b]
         if differ:
             raise ProcessError(f"{product.path} and the white reference differ in: {', '.join(differ)}.")
         cosine = dot(image.points.normal, image.points.to_source)
@@ -142,6 +142,6 @@ def exposure_of(product: Product) -> float:
     return float(exposure)
 
 
-def _alike(product: Product) -> tuple[object, ...]:
+def _conditions(product: Product) -> tuple[object, ...]:
     header = product.header
     return round(header.wavelength_nm), header.detector, product.facts["flat"] != "none", product.simulated

@@ -125,7 +125,7 @@ def get_files(name: str, cache: Path, progress: Progress | None = None) -> dict[
     files = sets[name].all_files()
     downloaded = {}
     for number, file in enumerate(files, 1):
-        downloaded[file.local] = _downloaded(name, sets[name], file, cache)
+        downloaded[file.local] = _download(name, sets[name], file, cache)
         if progress:
             progress(number, len(files))
     return downloaded
@@ -136,12 +136,12 @@ def find_files(name: str, roots: Sequence[Path]) -> dict[str, Path] | None:
     public_set = catalogue()[name]
     for root in roots:
         for form in filter(None, (public_set.all_files(), public_set.reduced)):
-            if (files := _found(root / name, form)) is not None:
+            if (files := _find_complete(root / name, form)) is not None:
                 return files
     return None
 
 
-def _found(folder: Path, files: Sequence[SetFile]) -> dict[str, Path] | None:
+def _find_complete(folder: Path, files: Sequence[SetFile]) -> dict[str, Path] | None:
     """The files where all are there with the right content."""
     paths = {}
     for file in files:
@@ -158,7 +158,7 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
-def _downloaded(name: str, public_set: PublicSet, file: SetFile, cache: Path) -> Path:
+def _download(name: str, public_set: PublicSet, file: SetFile, cache: Path) -> Path:
     import logging
 
     import pooch

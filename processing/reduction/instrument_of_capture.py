@@ -30,7 +30,7 @@ def require_belongs(capture: Capture, model: InstrumentModel) -> None:
         difference = f"its camera has {mosaics[has]}, that of the instrument {model.name!r} {mosaics[needs]}"
     elif not has and capture.channels != len(model.channels):
         difference = (
-            f"its frames have {_counted(capture.channels)}, the instrument {model.name!r} has {len(model.channels)}"
+            f"its frames have {_count_text(capture.channels)}, the instrument {model.name!r} has {len(model.channels)}"
         )
     elif missing := [axis for axis in model.axes if axis not in capture.angles_deg]:
         have = ", ".join(sorted(capture.angles_deg)) or "none"
@@ -53,5 +53,5 @@ def require_one_colour(capture: Capture) -> None:
         )
 
 
-def _counted(channels: int) -> str:
+def _count_text(channels: int) -> str:
     return "1 channel" if channels == 1 else f"{channels} channels"

@@ -151,7 +151,7 @@ class MuellerReduction:
         warnings = (*left_out.warnings, *cut_off)
         changes = capture_changes(capture, model, states)
         correction = correction or CountCorrection.of(capture)
-        counts, struck = counts_correction(changes, model), _among(left_out.hits, every, states)
+        counts, struck = counts_correction(changes, model), _renumber_hits(left_out.hits, every, states)
         basis = determined_basis(model)
         varies = changes is not None and bool(changes.field_retardance_rad)
         reader = BlockReader(capture, states, correction, counts, struck=struck)
@@ -206,15 +206,15 @@ class MuellerReduction:
 
     def block(self, solver: Solver, rows: slice) -> dict[str, NDArray[Any]]:
         """The planes of some rows, each (..., rows, columns)."""
-        planes_found = self._solved(solver, solver.reader.read(rows))
+        planes_found = self._solve(solver, solver.reader.read(rows))
         planes = self.planes
         shape = (rows.stop - rows.start, solver.reader.capture.frame_shape[1])
         if "mueller_physical" in planes and "mueller_physical" not in planes_found:
             planes_found["mueller_physical"] = nearest(planes_found["mueller"])
         return {name: planes_found[name].reshape(*plane.leading, *shape) for name, plane in planes.items()}
 
-    def _solved(self, solver: Solver, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        planes = self._estimated(solver, frames)
+    def _solve(self, solver: Solver, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        planes = self._estimate(solver, frames)
         lost = (planes["pixel_flags"] & LOST) != 0
         if self.sent is not None:
             planes |= self.sent.planes(planes["mueller"], planes["residual_rms"], solver)
@@ -226,7 +226,7 @@ class MuellerReduction:
         _blank(planes, lost, ~determined_elements(self.inversion.basis))
         return planes
 
-    def _estimated(self, solver: Solver, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    def _estimate(self, solver: Solver, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
         planes = solver.solve(frames)
         if self.levels is not None:
             self.levels.add_errors(planes, self.inversion)
@@ -243,7 +243,7 @@ class MuellerReduction:
         """
         solver = self.solver(capture)
         frames = solver.reader.read(rows)
-        planes = self._estimated(solver, frames)
+        planes = self._estimate(solver, frames)
         signal = np.empty(frames.shape, np.float32)
         solver.reader.signal(frames, slice(None), signal)
         shape = (rows.stop - rows.start, capture.frame_shape[1])
@@ -304,7 +304,7 @@ def _blank(planes: Mapping[str, NDArray[Any]], lost: NDArray[np.bool_], unseen: 
             values[..., lost] = np.nan
 
 
-def _among(hits: NDArray[np.int64], every: NDArray[np.int64], states: NDArray[np.int64]) -> NDArray[np.int64]:
+def _renumber_hits(hits: NDArray[np.int64], every: NDArray[np.int64], states: NDArray[np.int64]) -> NDArray[np.int64]:
     """Hits (H, 4) in `states`, their state counted among `states` and no longer among `every`."""
     out = hits[np.isin(every[hits[:, 0]], states)]
     out[:, 0] = np.searchsorted(states, every[out[:, 0]])

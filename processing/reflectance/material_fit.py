@@ -165,7 +165,7 @@ def _vectors(m0: Array) -> ComplexArray:
     return np.stack(vectors, axis=1)
 
 
-def _mixed(first: ComplexArray, second: ComplexArray) -> Array:
+def _mix(first: ComplexArray, second: ComplexArray) -> Array:
     """Matrix (N, 16) of the coherency |first><second| + |second><first|."""
     h = first[:, :, None] * second[:, None, :].conj()
     return coherency_to_mueller(h + np.swapaxes(h.conj(), 1, 2)).reshape(-1, 16)
@@ -174,15 +174,15 @@ def _mixed(first: ComplexArray, second: ComplexArray) -> Array:
 def _neighbours(m0: Array) -> Array:
     """Directions (N, 6, 16) in which a matrix has another dominant process than m0 (N, 16)."""
     v = _vectors(m0)
-    return np.stack([_mixed(v[:, 0], turn * v[:, k]) for k in (1, 2, 3) for turn in (1, 1j)], axis=1)
+    return np.stack([_mix(v[:, 0], turn * v[:, k]) for k in (1, 2, 3) for turn in (1, 1j)], axis=1)
 
 
 def _departures(m0: Array) -> Array:
     """Changes (8, N, 16) of M/m00 by small eigenvalues that differ, one standard deviation each."""
     v = _vectors(m0)
-    diagonal = [_mixed(v[:, k], v[:, k]) for k in (1, 2, 3)]
+    diagonal = [_mix(v[:, k], v[:, k]) for k in (1, 2, 3)]
     parts = [(diagonal[0] - diagonal[1]) / 2, (diagonal[0] + diagonal[1] - 2 * diagonal[2]) / np.sqrt(12)]
-    parts += [_mixed(v[:, i], turn * v[:, j]) / np.sqrt(2) for i, j in ((1, 2), (1, 3), (2, 3)) for turn in (1, 1j)]
+    parts += [_mix(v[:, i], turn * v[:, j]) / np.sqrt(2) for i, j in ((1, 2), (1, 3), (2, 3)) for turn in (1, 1j)]
     # Hermitian matrices of unit norm, over sqrt(2); with 8 of them the three eigenvalues have this deviation.
     return np.asarray(DEPARTURE * np.sqrt(3 / 8) * np.sqrt(2) * np.stack(parts))
 

@@ -263,12 +263,12 @@ def _curve(path: Path) -> ReportSection:
         rows = [row for row in csv.reader(read_text(path).splitlines(keepends=True)) if row]
     except csv.Error as error:
         raise ProcessError(f"{path}: cannot be read as CSV ({error})") from error
-    shown = [rows[0], *([_rounded(cell) for cell in row] for row in rows[1 : ROWS + 1])] if rows else []
+    shown = [rows[0], *([_round(cell) for cell in row] for row in rows[1 : ROWS + 1])] if rows else []
     name = path.name if len(rows) <= ROWS + 1 else f"{path.name}: first {ROWS} of {len(rows) - 1} rows"
     return ReportSection(path.name, [], (), [(name, shown)] if shown else ())
 
 
-def _rounded(cell: str) -> str:
+def _round(cell: str) -> str:
     try:
         number = float(cell)
     except ValueError:

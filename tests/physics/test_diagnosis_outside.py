@@ -11,7 +11,7 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.grammar import parsed
+from processing.instrument.grammar import parse_sentence
 from processing.instrument.grammar import sentences as sentences_of
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.schema import Sample
@@ -133,7 +133,7 @@ def test_every_sentence_is_read_back_from_its_text(configs):
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
     every = sentences_of(model, conditions)
     for sentence in every:
-        assert parsed(sentence.text) == sentence
+        assert parse_sentence(sentence.text) == sentence
     assert "azimuth of analyzer from state 5" in [s.text for s in every]
 
 
@@ -153,7 +153,7 @@ def test_light_that_is_reflected_inside_a_plate_passes_it_three_times(configs):
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
     angles = {axis: np.rad2deg(angle) for axis, angle in state_angles(STATES, False, False).items()}
     changes = Changes(Conditions.of(angles))
-    parsed("inner reflection of psa_retarder").apply(changes, model, np.array([0.01]))
+    parse_sentence("inner reflection of psa_retarder").apply(changes, model, np.array([0.01]))
     thrice = [
         e.model_copy(update={"retardance_deg": 3 * e.retardance_deg}) if e.name == "psa_retarder" else e
         for e in model.analyzer

@@ -19,26 +19,26 @@ class SentenceEffect(OpticsEffect):
         return tuple(s.text for s in grammar.sentences(model, conditions) if s.of_one_capture == self.of_one_capture)
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return grammar.parsed(place).parameters(conditions)
+        return grammar.parse_sentence(place).parameters(conditions)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
-        grammar.parsed(place).apply(changes, model, values)
+        grammar.parse_sentence(place).apply(changes, model, values)
 
     def moves_image(self, place: str) -> bool:
-        return grammar.parsed(place).quantities[0].startswith("shift")
+        return grammar.parse_sentence(place).quantities[0].startswith("shift")
 
     def reaches_around(self, place: str) -> bool:
-        return self.moves_image(place) or grammar.parsed(place).quantities == ("blur",)
+        return self.moves_image(place) or grammar.parse_sentence(place).quantities == ("blur",)
 
     def acts_on_counts(self, place: str) -> bool:
-        return grammar.parsed(place).site == "image" or self.is_pointwise(place)
+        return grammar.parse_sentence(place).site == "image" or self.is_pointwise(place)
 
     def is_pointwise(self, place: str) -> bool:
-        return grammar.parsed(place).quantities == ("offset",)
+        return grammar.parse_sentence(place).quantities == ("offset",)
 
     def undo(self, signal: Array, conditions: Conditions, place: str, values: Array) -> tuple[Array, Array]:
-        offset = values @ grammar.course(grammar.parsed(place).course, conditions)
+        offset = values @ grammar.course(grammar.parse_sentence(place).course, conditions)
         return signal - offset.reshape(-1, *(1,) * (signal.ndim - 1)), np.ones_like(signal)
 
     def log_price(self, model: InstrumentModel, conditions: Conditions, place: str) -> float:
-        return grammar.parsed(place).price(conditions)
+        return grammar.parse_sentence(place).price(conditions)

@@ -130,7 +130,7 @@ def open_array(text: str, kinds: str = "uif") -> Any:
             inside = inside.replace(".", "/")
         inside = inside or _only_stack(h5, name)
         if inside not in h5:
-            raise ImportFailed(f"{file}: no dataset {inside!r}; it has {_named(_datasets(h5))}")
+            raise ImportFailed(f"{file}: no dataset {inside!r}; it has {_names_text(_datasets(h5))}")
         dataset = require_dataset(h5, inside, (None,) * getattr(h5.get(inside), "ndim", 3), kinds)
         # MATLAB writes its axes in the order of Fortran.
         return dataset[...].T if name.endswith(".mat") else dataset
@@ -229,10 +229,10 @@ def _of_archive(file: Path, name: str) -> NDArray[Any]:
 def _require_array(file: Path, name: str, arrays: Sequence[str]) -> None:
     if name not in arrays:
         missing = f"no array {name!r}; " if name else ""
-        raise ImportFailed(f"{file}: {missing}it has {_named(arrays)}. Choose one as {file}::NAME")
+        raise ImportFailed(f"{file}: {missing}it has {_names_text(arrays)}. Choose one as {file}::NAME")
 
 
-def _named(names: Sequence[str]) -> str:
+def _names_text(names: Sequence[str]) -> str:
     return one_line(", ".join(names), 300) or "none"
 
 
@@ -251,6 +251,6 @@ def _only_stack(h5: h5py.File, file: str) -> str:
     stacks = _datasets(h5, 3)
     if len(stacks) != 1:
         raise ImportFailed(
-            f"{file}: datasets with three or four dimensions: {_named(stacks)}. Choose one as {file}::/NAME"
+            f"{file}: datasets with three or four dimensions: {_names_text(stacks)}. Choose one as {file}::/NAME"
         )
     return stacks[0]

@@ -136,7 +136,7 @@ def read_states(
     ignored: dict[str, list[str]] = {}
     if mapping:
         of_file = {n: t for n, t in mapping.items() if n not in vectors}
-        header, rows, ignored = _mapped(path, header, rows, of_file, axes=axes)
+        header, rows, ignored = _map_columns(path, header, rows, of_file, axes=axes)
     if "state" not in header:
         header, rows = ["state", *header], [(line, [str(k), *row]) for k, (line, row) in enumerate(rows)]
     header, rows = _with_arrays(path, header, rows, vectors)
@@ -203,7 +203,7 @@ def _rows_without_table(vectors: Mapping[str, NDArray[np.float64]], count: int |
     return [(k + 1, []) for k in range(count)]
 
 
-def _mapped(
+def _map_columns(
     path: Path, header: list[str], rows: list[Row], mapping: Mapping[str, str], *, axes: Sequence[str]
 ) -> tuple[list[str], list[Row], dict[str, list[str]]]:
     """The columns that have a name here, by the mapping or already in the file; and the others."""
@@ -262,11 +262,11 @@ def _table(path: Path, required: Sequence[str]) -> tuple[list[str], list[Row], d
         # As numpy writes a table: its names are a comment.
         first -= 1
         text_lines[first] = text_lines[first].lstrip("# ")
-    header, rows, delimiter = _parsed(path, text_lines, first)
+    header, rows, delimiter = _parse_rows(path, text_lines, first)
     if any(len(row) != len(header) for _, row in rows) or not set(required) <= set(header):
         # A log may begin with lines on the measurement: the header is the first that fits all rows after it.
         for start in range(first + 1, min(first + MOST_LINES_BEFORE, len(text_lines))):
-            table = _parsed(path, text_lines, start)
+            table = _parse_rows(path, text_lines, start)
             fits = table[1] and all(len(row) == len(table[0]) for _, row in table[1]) and set(required) <= set(table[0])
             if fits and not any(map(_is_number, table[0])) and (required or len(table[0]) > 1):
                 header, rows, delimiter = table
@@ -293,7 +293,7 @@ def _table(path: Path, required: Sequence[str]) -> tuple[list[str], list[Row], d
     return [header[k] for k in used], [(line, [row[k] for k in used]) for line, row in rows], units, delimiter
 
 
-def _parsed(path: Path, text_lines: list[str], first: int) -> tuple[list[str], list[Row], str]:
+def _parse_rows(path: Path, text_lines: list[str], first: int) -> tuple[list[str], list[Row], str]:
     """Header and rows from one line on."""
     title = text_lines[first] if text_lines else ""
     delimiter = max(DELIMITERS, key=title.count)

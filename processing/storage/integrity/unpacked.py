@@ -68,7 +68,7 @@ def read_rows(
     start, stop, step = rows.indices(source.shape[-2])
     if step == 1 and stop > start and is_packed(source):
         try:
-            return _unpacked(source, start, stop, first, cache=cache)
+            return _unpack(source, start, stop, first, cache=cache)
         except (OSError, ValueError, RuntimeError, DAMAGED):
             # A chunk that was never written, is not packed, or is damaged.
             pass
@@ -84,7 +84,7 @@ def is_packed(source: h5py.Dataset) -> bool:
     return bool(native and source.scaleoffset is None and set(chunk[:-2]) <= {1} and chunk[-1] == source.shape[-1])
 
 
-def _unpacked(
+def _unpack(
     source: h5py.Dataset, start: int, stop: int, first: tuple[int, ...], *, cache: KeptChunks | None
 ) -> NDArray[Any]:
     more, columns, height = source.shape[len(first) : -2], source.shape[-1], source.chunks[-2]

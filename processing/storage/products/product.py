@@ -333,13 +333,13 @@ class Product(OpenH5):
 
     def units(self, name: str) -> str:
         """Unit of a dataset."""
-        return self._said(name, "units")
+        return self._attribute_text(name, "units")
 
     def long_name(self, name: str) -> str:
         """What a dataset is, in one line."""
-        return self._said(name, "long_name")
+        return self._attribute_text(name, "long_name")
 
-    def _said(self, name: str, attribute: str) -> str:
+    def _attribute_text(self, name: str, attribute: str) -> str:
         dataset = self._dataset(name)
         with damage_as(ProductError, f"{self.path} is damaged"):
             return text_attribute(dataset, attribute)
