@@ -86,6 +86,13 @@ def field_terms(x: Array, y: Array) -> Array:
     return np.stack([x, y, x * x - 1 / 3, x * y, y * y - 1 / 3])
 
 
+#: Changes by name that add up.
+ADDED = (
+    *("azimuth_rad", "retardance_rad", "extinction", "diattenuation", "depolarization"),
+    *("field_retardance_rad", "response"),
+)
+
+
 def _zeros() -> defaultdict[str, Array]:
     return defaultdict(lambda: np.zeros(()))
 
@@ -112,7 +119,7 @@ class Changes:
     depolarization: defaultdict[str, Array] = field(default_factory=_zeros)
     after: dict[str, Array] = field(default_factory=dict)
     before: dict[str, Array] = field(default_factory=dict)
-    field_retardance_rad: dict[str, Array] = field(default_factory=dict)
+    field_retardance_rad: defaultdict[str, Array] = field(default_factory=_zeros)
     gain: Array = field(init=False)
     stray: Array | float = 0.0
     mixing: Array | None = None
@@ -158,6 +165,25 @@ class Changes:
         kinds = (self.retardance_rad, self.extinction, self.diattenuation, self.depolarization)
         parts = (azimuth_rad, *(change[element] for change in kinds))
         return element, b"|".join(np.asarray(p, dtype=float).tobytes() for p in parts)
+
+    def add(self, other: "Changes") -> None:
+        """Add what others ask for, of the same conditions."""
+        for name in ADDED:
+            own, more = getattr(self, name), getattr(other, name)
+            for key, value in more.items():
+                own[key] = own[key] + value
+        for element, mueller in other.after.items():
+            self.follow(element, mueller)
+        for element, mueller in other.before.items():
+            self.precede(element, mueller)
+        if other.mixing is not None:
+            self.mixing = other.mixing if self.mixing is None else other.mixing @ self.mixing
+        self.gain = self.gain * other.gain
+        self.stray = self.stray + other.stray
+        self.lag += other.lag
+        self.shift_px = self.shift_px + other.shift_px
+        self.blur_px2 = self.blur_px2 + other.blur_px2
+        self.drop_clipped = self.drop_clipped or other.drop_clipped
 
     def turn_axis(self, axis: str, error_deg: Array, elements: Mapping[str, float]) -> None:
         """The axis stands `error_deg` (N,) from where it says; `elements` are the ratios of those that it turns."""

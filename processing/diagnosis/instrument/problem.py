@@ -39,6 +39,8 @@ ENOUGH_SOUND = 1.5
 MOST_POINTS = 3
 #: [matrices] Of elements that are kept for use in another evaluation.
 MOST_BUILT = 64
+#: [changes] Of single candidates that are kept: a step of each is asked again and again.
+MOST_ASKED = 4096
 
 
 class InstrumentProblem:
@@ -59,7 +61,6 @@ class InstrumentProblem:
         moved_back: bool = False,
     ) -> None:
         self.undone = dict(undone or {})
-        self._others: list[InstrumentProblem] = []
         self.models = (models,) * len(captures) if isinstance(models, InstrumentModel) else tuple(models)
         self.model = self.models[0]
         self.wavelengths_nm = tuple(c.wavelength_nm for c in captures)
@@ -71,7 +72,7 @@ class InstrumentProblem:
         self.captures = self.still if moved_back else _moved_back(self.still, self.own_px)
         self.folds = folds or folds_of(self.captures)
         self.moments: tuple[Moments, ...] = tuple(moments_of(c, self.folds) for c in self.captures)
-        self._built: list[dict[tuple[str, bytes], Array]] = [{} for _ in self.captures]
+        self.forget_linearizations()
         self.noise_known = all(c.noise_known for c in self.captures)
         self.holds_out_states = any(m.tiles is None for m in self.moments)
         self.spread = max(m.spread for m in self.moments)
@@ -165,8 +166,9 @@ class InstrumentProblem:
 
     def forget_linearizations(self) -> None:
         """Drop what was built for another model or other states; the moments of the counts stay."""
-        self._others = []
-        self._built = [{} for _ in self.captures]
+        self._others: list[InstrumentProblem] = []
+        self._built: list[dict[tuple[str, bytes], Array]] = [{} for _ in self.captures]
+        self._asked: list[dict[tuple[str, str, bytes], Changes]] = [{} for _ in self.captures]
 
     def with_models(self, models: Sequence[InstrumentModel]) -> InstrumentProblem:
         """The same captures against other models of the same instrument."""
@@ -220,19 +222,31 @@ class InstrumentProblem:
         built = self._built[capture]
         if len(built) > MOST_BUILT:
             built.clear()
-        model = self.models[capture]
         changes = Changes(data.conditions, built=built)
-        for applied in model.effects:
-            if applied.scope == "instrument" or data.name in applied.captures:
-                apply_to(changes, model, applied)
-        changes.shift_px = changes.shift_px - self.own_px[capture] * data.pitch
+        changes.add(self._changes_of(capture, None, np.zeros(0)))
         # At zero an effect does nothing: there is no need to ask it.
-        other_than_zero = [0, *np.cumsum(values != 0).tolist()]
-        for candidate, part in space.pairs:
-            is_active = other_than_zero[part.stop] > other_than_zero[part.start]
-            if is_active and candidate.acts(capture, data.wavelength_nm):
-                candidate.apply(changes, model, values[part])
+        for candidate, own in space.other_than_zero(values):
+            if candidate.acts(capture, data.wavelength_nm):
+                changes.add(self._changes_of(capture, candidate, own))
         return changes
+
+    def _changes_of(self, capture: int, candidate: Candidate | None, values: Array) -> Changes:
+        """Changes of one capture by one candidate alone, not to be altered; None: by the instrument's own effects."""
+        known, model, data = self._asked[capture], self.models[capture], self.captures[capture]
+        name = (candidate.kind, candidate.place) if candidate else ("", "")
+        key = (*name, values.tobytes())
+        if key not in known:
+            if len(known) > MOST_ASKED:
+                known.clear()
+            out = known[key] = Changes(data.conditions)
+            if candidate:
+                candidate.apply(out, model, values)
+            else:
+                for applied in model.effects:
+                    if applied.scope == "instrument" or data.name in applied.captures:
+                        apply_to(out, model, applied)
+                out.shift_px = out.shift_px - self.own_px[capture] * data.pitch
+        return known[key]
 
     @property
     def held_out(self) -> str:

@@ -62,11 +62,21 @@ def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic
     factors = _signal_share(problem, space, x, h, typical=typical)
     h, g = h * np.outer(factors, factors), g * factors
     excess, g, h = _integrate_out(np.sqrt(problem.time_noise(space, x)) / typical, excess, g, h)
-    value, vector = np.linalg.eigh(h)
-    h = (vector * np.maximum(value, 0.0)) @ vector.T
+    h = _without_negative(h)
     z = x / typical
     total = excess if problem.noise_known else excess + freedom
     return Quadratic(float(total - 2 * g @ z + z @ h @ z), g - h @ z, h)
+
+
+def _without_negative(h: Array) -> Array:
+    """The matrix without its negative eigenvalues; a root, which is quick, shows whether there are any."""
+    rounding = h.shape[0] * np.finfo(float).eps * float(h.diagonal().max(initial=0.0))
+    try:
+        np.linalg.cholesky(h + rounding * np.eye(h.shape[0]))
+    except np.linalg.LinAlgError:
+        value, vector = np.linalg.eigh(h)
+        return np.asarray((vector * np.maximum(value, 0.0)) @ vector.T)
+    return h
 
 
 def _integrate_out(sigma: Array, excess: float, g: Array, h: Array) -> tuple[float, Array, Array]:

@@ -170,7 +170,12 @@ class Sets:
         self.many = np.array([g.index.size >= MANY and noise.is_known for g in groups], dtype=bool)
         self.tau_weight = np.where(self.many[:, None], TAU_WEIGHT_OF_MANY, TAU_WEIGHT)
         sizes = np.array([g.index.size for g in groups])
-        self._alike = [np.flatnonzero((sizes == n) & self.free) for n in np.unique(sizes)]
+        #: Groups of one size, where their values stand (G, n), and the curvature (G, n, n) of each.
+        self._alike: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
+        for n in np.unique(sizes):
+            if (members := np.flatnonzero((sizes == n) & self.free)).size:
+                index = np.stack([self.groups[i].index for i in members])
+                self._alike.append((members, index, form.curvature[index[:, :, None], index[:, None, :]]))
 
     def empty(self) -> State:
         """The set of what is always there."""
@@ -251,11 +256,7 @@ class Sets:
         log_odds = np.full(len(self.groups), np.inf)
         weights, now = np.zeros((len(self.groups), self.taus.size)), self.noise.log_likelihood(fit.excess)
         for members, s, q in self._cavities(state, fit, inverse, right):
-            # Most groups are one value, which is its own axis: LAPACK would take as long for each as for a matrix.
-            alone = s.shape[1] == 1
-            value, vector = (s[:, 0], np.ones_like(s)) if alone else np.linalg.eigh((s + s.transpose(0, 2, 1)) / 2)
-            value = np.maximum(value, 0.0)[:, None]
-            along = (vector.transpose(0, 2, 1) @ q[:, :, None])[:, None, :, 0] ** 2
+            value, along = _along_axes(s, q)
             t2 = (self.taus**2)[:, None]
             explained = np.sum(t2 * along / (1 + t2 * value), axis=2)
             gain = 0.5 * (explained - np.sum(np.log1p(t2 * value), axis=2))
@@ -277,17 +278,14 @@ class Sets:
         self, state: State, fit: Fitted, inverse: Array, right: Array
     ) -> Iterator[tuple[NDArray[np.int64], Array, Array]]:
         """Groups of one size, with curvature (G, n, n) and gradient (G, n) about zero given all other groups."""
-        u, h = state.unit, self.form.curvature
-        cross = inverse @ h[fit.active] / u
-        gradient = self.form.gradient / u - cross.T @ right
+        u = state.unit
+        cross = self.form.curvature[fit.active].T @ (inverse.T / u)
+        gradient = self.form.gradient / u - cross @ right
         where = np.full(self.size, -1)
         where[fit.active] = np.arange(fit.active.size)
-        for members in self._alike:
-            if not members.size:
-                continue
-            index = np.stack([self.groups[i].index for i in members])
-            part = cross[:, index].transpose(1, 2, 0)
-            s = h[index[:, :, None], index[:, None, :]] / u - part @ part.transpose(0, 2, 1)
+        for members, index, own_curvature in self._alike:
+            part = cross[index]
+            s = own_curvature / u - part @ part.transpose(0, 2, 1)
             q = gradient[index]
             for k in np.flatnonzero(state.tau[members] > 0):
                 at = where[index[k]]
@@ -296,6 +294,16 @@ class Sets:
                 s[k] = precision - np.eye(at.size) * state.tau[members[k]] ** -2.0
                 q[k] = -precision @ fit.mean[at]
             yield members, s, q
+
+
+def _along_axes(s: Array, q: Array) -> tuple[Array, Array]:
+    """Eigenvalues (G, 1, n) of matrices s (G, n, n), and squares (G, 1, n) of vectors q (G, n) along their axes."""
+    if s.shape[1] == 1:
+        # Most groups are one value, which is its own axis: LAPACK would take as long for each as for a matrix.
+        return np.maximum(s, 0.0), q[:, None] ** 2
+    value, vector = np.linalg.eigh((s + s.transpose(0, 2, 1)) / 2)
+    along = (q[:, None] @ vector) ** 2
+    return np.maximum(value, 0.0)[:, None], along
 
 
 def _root(matrix: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -98,6 +98,7 @@ class Space:
     candidates: tuple[Candidate, ...]
     slices: tuple[slice, ...] = field(init=False)
     size: int = field(init=False)
+    _owner: NDArray[np.int64] = field(init=False, repr=False, compare=False)
     _acting: dict[tuple[int, float], Acting] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -106,6 +107,7 @@ class Space:
             slices.append(slice(start, start + candidate.size))
             start += candidate.size
         self.slices, self.size = tuple(slices), start
+        self._owner = np.repeat(np.arange(len(slices)), [c.size for c in self.candidates])
 
     @property
     def fixed(self) -> NDArray[np.bool_]:
@@ -131,6 +133,11 @@ class Space:
     def pairs(self) -> list[tuple[Candidate, slice]]:
         """Candidates, each with where its values stand in the common vector."""
         return list(zip(self.candidates, self.slices, strict=True))
+
+    def other_than_zero(self, values: Array) -> Iterator[tuple[Candidate, Array]]:
+        """Candidates of which a value is not zero, each with its values, of the common vector (K,)."""
+        for k in np.unique(self._owner[np.flatnonzero(values)]):
+            yield self.candidates[k], values[self.slices[k]]
 
     def split(self, values: Array) -> dict[Candidate, Array]:
         """Values by candidate, of the common vector (K,)."""

@@ -27,5 +27,4 @@ class FieldRetardance(InstrumentEffect):
         return tuple(e.name for e in model.elements() if isinstance(e, Retarder))
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
-        old = changes.field_retardance_rad.get(place, np.zeros(len(FIELD_TERMS)))
-        changes.field_retardance_rad[place] = old + np.deg2rad(values)
+        changes.field_retardance_rad[place] = changes.field_retardance_rad[place] + np.deg2rad(values)
