@@ -12,6 +12,7 @@ import numpy as np
 
 from processing.doors import require_new
 from processing.errors import ProcessError
+from processing.extras import needed
 from processing.maps.means import mean_of
 from processing.maps.region import parse_region
 from processing.steps.reduction import Reduction
@@ -50,6 +51,7 @@ def open_dataset(path: Path | str) -> xr.Dataset:
     >>> dict(counts.sizes), counts.units
     ({'state': 42, 'channel': 1, 'y': 24, 'x': 32}, 'count')
     """
+    needed("xarray", "xarray")
     path = Path(path)
     return _of_product(path) if is_product(path) else _of_capture(path)
 
@@ -88,6 +90,7 @@ def open_campaign(folder: Path | str, kind: str = "mueller") -> xr.Dataset:
     >>> median.dims, median.omega.values.tolist()
     (('omega',), [35.0, 60.0])
     """
+    needed("xarray", "xarray")
     import xarray as xr
 
     files = [path for path in sorted(Path(folder).rglob("*.h5")) if is_product(path)]
@@ -162,6 +165,7 @@ def follow_region(folder: Path | str, region: str | None = None, kind: str = "mu
     >>> found.omega.values.tolist(), found.value.dims
     ([35.0, 60.0], ('file',))
     """
+    needed("xarray", "xarray")
     import xarray as xr
 
     lines: list[tuple[Any, ...]] = []
@@ -268,6 +272,7 @@ def reduce_to_dataset(capture: Path | str, instrument: Path | str | None = None,
     >>> image.mueller.dims, image.mueller_errors.units
     (('row', 'column', 'y', 'x'), 'count')
     """
+    needed("xarray", "xarray")
     step = Reduction(Path(capture), Path(instrument) if instrument else None, **options)
     with tempfile.TemporaryDirectory() as folder:
         return open_dataset(step.make(Path(folder) / "reduced.h5"))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.computing.compiling import compiled
 from processing.polarization.coherency_jacobi import EXACT, T, jacobi_tile, jit, project
-from processing.polarization.mueller import coherency, from_jones
+from processing.polarization.mueller import coherency, coherency_to_mueller, from_jones
 
 NEWTON_STEPS = 12
 # The error after a step is step^2 p''/(2 p'), at most 4e3 step^2 where the slope is not too small: no digit is left.
@@ -243,9 +243,26 @@ def _processes(vectors: NDArray[np.complex128], scale: Array) -> Array:
 
 def _dominant_at_once(m: Array, pixels: int, xi0: Array, out: Array) -> None:
     a, scale = _scaled(m, pixels)
-    values, vectors = np.linalg.eigh(a)
-    xi0[:pixels] = 0.25 + scale * values[:, 3]
-    out[:, :pixels] = _processes(vectors[..., 3], scale)
+    b = a @ a
+    fourth = np.square(np.abs(b)).sum(axis=(1, 2))
+    e3, e4 = np.einsum("pij,pji->p", a, b).real / 3, (0.5 - fourth) / 4
+    x = step = np.sqrt(np.sqrt(fourth * (27 / 28)))
+    with np.errstate(all="ignore"):
+        for _ in range(NEWTON_STEPS):
+            step = (((x * x - 0.5) * x - e3) * x + e4) / ((4 * x * x - 1) * x - e3)
+            x = x - step
+            if not (np.abs(step) > LAST_STEP).any():
+                break
+        slope, square = (4 * x * x - 1) * x - e3, x * x - 0.5
+        unsure = ~((slope > SMALLEST_SLOPE) & (np.abs(step) <= LAST_STEP))
+        projector = a @ (b + x[:, None, None] * a + square[:, None, None] * np.eye(4))
+        shift = x * square - (np.trace(projector, axis1=1, axis2=2).real - x) / 3
+        projector += shift[:, None, None] * np.eye(4)
+    values, vectors = np.linalg.eigh(a[unsure])
+    x[unsure], projector[unsure] = values[:, 3], vectors[..., 3:] @ np.conj(np.swapaxes(vectors[..., 3:], 1, 2))
+    xi0[:pixels] = 0.25 + scale * x
+    found = coherency_to_mueller(projector).reshape(-1, 16).T
+    out[:, :pixels] = np.where(scale > 0, found / found[0], np.nan)
 
 
 def _eigenvalues_at_once(m: Array, pixels: int, xi: Array) -> None:

@@ -1,4 +1,4 @@
-"""Analysis on macOS and Windows: what Python has on Linux alone is taken away before the commands run."""
+"""Analysis on macOS and Windows by `pip install umov`: what Linux alone and what an extra has is taken away before."""
 
 import json
 import subprocess
@@ -15,7 +15,8 @@ names = "sched_getaffinity sched_setaffinity posix_fallocate posix_fadvise memfd
 for name in (names + " O_NONBLOCK O_NOCTTY O_DIRECTORY O_SYNC getuid geteuid nice pread pwrite syncfs sync").split():
     if hasattr(os, name):
         delattr(os, name)
-for module in ("fcntl", "termios", "resource", "pwd", "grp", "pty", "tty", "syslog"):
+modules = "fcntl termios resource pwd grp pty tty syslog numba llvmlite cv2 xarray pandas trimesh embreex"
+for module in modules.split():
     sys.modules[module] = None
 from processing.commands.program import main
 for words in json.load(sys.stdin):
@@ -23,7 +24,7 @@ for words in json.load(sys.stdin):
         main(words)
     except SystemExit as end:
         if end.code:
-            raise
+            print(words[:2], end.code)
 """
 
 
@@ -35,8 +36,9 @@ def test_import_reduce_and_diagnose_where_linux_has_no_part(tmp_path, configs):
     instrument = configs / "instruments/drr_imaging_630nm.yaml"
     sample = ("--sample", "mirror", "--wavelength-nm", table.wavelength_nm, "--instrument", instrument)
     given = ("process", "import", "--states", states, "--out", "mirror.h5", *sample)
-    others = (("process", command, "mirror.h5") for command in ("reduce", "quantities", "report"))
-    words = [[str(word) for word in line] for line in (given, *others, ("diagnose", "mirror.h5"))]
+    others = (("process", command, "mirror.h5") for command in ("reduce", "xi0", "quantities", "report"))
+    refused = ("process", "export", "mirror.mueller.h5", "--to", "csv")
+    words = [[str(word) for word in line] for line in (given, *others, ("diagnose", "mirror.h5"), refused)]
     # In one program: it is loaded once.
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", WITHOUT],
@@ -48,3 +50,6 @@ def test_import_reduce_and_diagnose_where_linux_has_no_part(tmp_path, configs):
     )
     assert done.returncode == 0, done.stderr[-3000:]
     assert "residual 1.42 % -> 0.1" in done.stdout
+    assert done.stdout.endswith("['process', 'export'] 2\n")
+    assert done.stdout.count("['") == 1
+    assert "needs xarray: pip install 'umov[xarray]'" in done.stderr

@@ -31,10 +31,9 @@ def _at_once(
         outer, square = np.swapaxes(d, 1, 2) @ d, (d @ np.swapaxes(d, 1, 2))
         q = np.sqrt(np.where(square < 1, 1 - square, np.nan))
         x = (m[:, 1:, 1:] - p @ d) @ (three + outer / (q + q * q)) / q
-        relative = np.linalg.det(x) / np.square(x).sum(axis=(1, 2)) ** 1.5
+        r, relative = _polar_factors(np.moveaxis(x, 0, -1))
         turn = np.where(np.abs(relative) > SMALLEST_DETERMINANT, np.sign(relative), np.nan)[:, None, None]
-        u, _, vt = np.linalg.svd(np.where(np.isnan(turn), three, x))
-        r = turn * (u @ vt)
+        r = turn * np.moveaxis(r, -1, 0)
         block = x @ np.swapaxes(r, 1, 2)
         parts = np.empty((3, len(m), 4, 4))
         parts[:] = one + 0 * turn
@@ -48,6 +47,23 @@ def _at_once(
     for out, factor in zip((depolarizer, retarder, diattenuator), parts, strict=True):
         out[:, part] = factor.reshape(-1, 16).T
     sign[part] = turn[:, 0, 0]
+
+
+def _polar_factors(x: Array) -> tuple[Array, Array]:
+    """Orthogonal polar factors of matrices x (3, 3, pixels), and det x / |x|^3 (pixels,)."""
+    after, last, relative = [1, 2, 0], [2, 0, 1], None
+    x = np.ascontiguousarray(x)
+    for _ in range(STEPS):
+        y, z = x[after], x[last]
+        cofactors = y[:, after] * z[:, last] - y[:, last] * z[:, after]
+        det, norm = (x[0] * cofactors[0]).sum(axis=0), np.square(x).sum(axis=(0, 1))
+        relative = det / norm**1.5 if relative is None else relative
+        inverse = np.square(cofactors).sum(axis=(0, 1)) / det**2
+        g = np.sqrt(np.sqrt(inverse / norm))
+        x = 0.5 * g * x + 0.5 / (det * g) * cofactors
+        if not (norm + inverse > 6 + 1e-14).any():
+            break
+    return x, np.asarray(relative)
 
 
 @compiled(_at_once, **EXACT)
