@@ -18,7 +18,7 @@ from drivers.axis_types import NO_LIMIT_DEG, Limits
 from drivers.errors import LimitError
 from processing.doors import one_line
 from processing.instrument.applied_effects import changes_at
-from processing.instrument.determined import determined_basis
+from processing.instrument.determined_basis import determined_basis
 from processing.instrument.model import InstrumentModel, WavelengthError, rank
 from processing.instrument.states import StateTable
 from processing.yaml_file import ConfigError

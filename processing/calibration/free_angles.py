@@ -16,7 +16,7 @@ from processing.arrays import Array
 from processing.calibration.state_design import AssumedNoise
 from processing.computing.blas import one_blas_thread
 from processing.errors import ProcessError
-from processing.instrument.determined import DRAWN, determined_basis
+from processing.instrument.determined_basis import DRAWN, determined_basis
 from processing.instrument.model import InstrumentModel, Retarder
 
 #: Step of the central difference of a row by an angle, radians: truncation and rounding are both near 1e-9 there.

@@ -6,7 +6,7 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.calibration.free_angles import retardance_deg, turning_retarders, with_retardances
-from processing.instrument.determined import determined_basis
+from processing.instrument.determined_basis import determined_basis
 from processing.instrument.model import InstrumentModel
 
 #: The errors that `diagnose` finds most often, at the size of a bench that was set up with care.

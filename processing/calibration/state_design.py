@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from processing.arrays import Array
 from processing.doors import read_text
 from processing.errors import ProcessError
-from processing.instrument.determined import determined_elements
+from processing.instrument.determined_basis import determined_elements
 from processing.instrument.model import InstrumentModel, Retarder, rank
 from processing.instrument.states import Role, StateTable, rotating_retarders
 from processing.polarization import mueller

@@ -75,7 +75,7 @@ def design_command(
     from processing.calibration.free_angles import bound_of
     from processing.calibration.state_design import AssumedNoise, score
     from processing.instrument.applied_effects import changes_at
-    from processing.instrument.determined import determined_basis
+    from processing.instrument.determined_basis import determined_basis
     from processing.instrument.model import InstrumentModel
 
     model = InstrumentModel.load(instrument)

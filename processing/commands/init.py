@@ -42,7 +42,7 @@ def init_command(
     """Ask ten questions about a polarimeter and write its instrument file. Enter takes the answer in brackets."""
     from processing.doors import require_new
     from processing.errors import ProcessError
-    from processing.instrument.determined import determined_basis, determined_elements
+    from processing.instrument.determined_basis import determined_basis, determined_elements
     from processing.instrument.model import InstrumentModel
     from processing.whole_file import write_new_text
     from processing.yaml_file import parse_yaml

@@ -9,7 +9,7 @@ from processing.arrays import Array
 from processing.effect import EffectError
 from processing.instrument.applied_effects import changes_of, instrument_effects
 from processing.instrument.changes import Conditions
-from processing.instrument.determined import LEAST, determined_basis
+from processing.instrument.determined_basis import LEAST, determined_basis
 from processing.instrument.elements import Dispersive, number
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.instrument.nominal import KIND

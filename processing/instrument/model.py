@@ -24,8 +24,8 @@ from processing.instrument.elements import WavelengthError as WavelengthError
 from processing.instrument.fitted import AppliedEffect as AppliedEffect
 from processing.instrument.fitted import EffectParameter as EffectParameter
 from processing.instrument.fitted import SystematicError as SystematicError
-from processing.instrument.measured import MeasuredMatrix
-from processing.instrument.stated import TRAINS, Correlation, without_u
+from processing.instrument.measured_matrix import MeasuredMatrix
+from processing.instrument.stated_uncertainty import TRAINS, Correlation, without_u
 from processing.section import Section
 from processing.yaml_file import load_yaml
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.instrument.determined import determined_elements
+from processing.instrument.determined_basis import determined_elements
 from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.inversion import Inversion

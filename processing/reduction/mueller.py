@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.effects_of_capture import references
+from processing.reduction.exclusions import Exclusions
 from processing.reduction.facts import mueller_facts
-from processing.reduction.left_out import Exclusions
 from processing.reduction.measurement_matrix import exposure_fact, some_of
 from processing.reduction.mueller_reduction import Choice, MuellerReduction
 from processing.reduction.noise import NoiseModel

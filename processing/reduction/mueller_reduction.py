@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.errors import ProcessError
-from processing.instrument.determined import determined_basis, determined_elements
+from processing.instrument.determined_basis import determined_basis, determined_elements
 from processing.instrument.model import InstrumentModel
 from processing.polarization.physical import nearest
 from processing.reduction.counts_to_signal import BlockReader, CountCorrection
 from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import CountsCorrection, capture_changes, counts_correction
+from processing.reduction.exclusions import Exclusions
 from processing.reduction.facts import determined_words
-from processing.reduction.left_out import Exclusions
 from processing.reduction.measurement_matrix import field_of, measurement_matrix
 from processing.reduction.noise import NoiseModel, noise_of
 from processing.reduction.sample_states import sample_states

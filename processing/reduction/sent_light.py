@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import BoolArray
-from processing.instrument.determined import determined_elements
+from processing.instrument.determined_basis import determined_elements
 from processing.reduction.solvers.base import Solver
 from processing.reduction.solvers.inversion import Inversion
 from processing.reduction.solvers.plain import LEAST

@@ -14,9 +14,9 @@ from processing.polarization.magnitude import directions, interval
 from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import CountsCorrection, capture_changes, counts_correction, references
+from processing.reduction.exclusions import Exclusions
 from processing.reduction.facts import in_words
 from processing.reduction.instrument_of_capture import require_one_colour
-from processing.reduction.left_out import Exclusions
 from processing.reduction.measurement_matrix import exposure_fact
 from processing.reduction.mosaic.demosaic import demosaic
 from processing.reduction.mosaic.layout import MosaicLayout

@@ -20,7 +20,7 @@ from processing.reflectance.table_axes import SHAPE, Layout, TableAxes
 from processing.reflectance.table_kernels import add_sums, claim_rows
 from processing.storage.captures.nexus import add_group, add_scales, attach, declare, default_plot, describe_light
 from processing.storage.integrity.h5_door import damage_as, mark_of, open_h5, require_dataset, require_group
-from processing.storage.integrity.packed import LEVEL, Packing
+from processing.storage.integrity.packing import LEVEL, Packing
 from processing.storage.products.provenance import Step, read_steps, sign, write_steps
 
 #: 1 had everything in the root, without NeXus groups; up to 2 the errors were quantities with names of their own.

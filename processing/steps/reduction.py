@@ -8,9 +8,9 @@ from typing import Any
 from processing.calibration.photon_transfer import read_camera
 from processing.errors import ProcessError
 from processing.reduction.counts_to_signal import CountCorrection
+from processing.reduction.exclusions import Exclusions
 from processing.reduction.flat import flat_captures, nearest_flat
 from processing.reduction.instrument_of_capture import choose_model
-from processing.reduction.left_out import Exclusions
 from processing.reduction.mueller import reduce_mueller
 from processing.reduction.mueller_reduction import Choice
 from processing.steps.file_step import FileStep, Found, Progress

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.captured.read_capture import read_capture
-from processing.diagnosis.captured.screening import screen_capture
+from processing.diagnosis.captures.read_capture import read_capture
+from processing.diagnosis.captures.screening import screen_capture
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import PRIOR_WIDTH, minimize

@@ -9,7 +9,7 @@ import pytest
 from scipy.io import savemat
 
 from processing.instrument.elements import Diattenuator, Polarizer, Retarder
-from processing.instrument.measured import MeasuredMatrix
+from processing.instrument.measured_matrix import MeasuredMatrix
 from processing.instrument.model import Channel, InstrumentModel
 from processing.storage.captures.capture import Capture
 from processing.storage.formats.import_request import name_of_item

@@ -16,7 +16,7 @@ from acquisition.rig.open_rig import open_rig
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
 from processing.commands.application import main
-from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captures.read_capture import read_capture
 from processing.reduction.counts_to_signal import CountCorrection
 from processing.storage.captures.capture import Capture
 from processing.storage.integrity.checksums import state_crc32, summed_values

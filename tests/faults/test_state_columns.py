@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captures.read_capture import read_capture
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mueller import reduce_mueller
 from processing.reduction.mueller_reduction import Choice

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from isal import isal_zlib
 
-from processing.storage.integrity import packed
-from processing.storage.integrity.unpacked import KeptChunks, is_packed, read_rows
+from processing.storage.integrity import packing
+from processing.storage.integrity.unpacking import KeptChunks, is_packed, read_rows
 
 SHAPE = (3, 2, 70, 40)
 
@@ -14,12 +14,12 @@ SHAPE = (3, 2, 70, 40)
 @pytest.fixture
 def write(tmp_path, monkeypatch):
     """Writes a packed dataset in chunks of 16 rows, the last of each plane not full."""
-    monkeypatch.setattr(packed, "CHUNK_PIXELS", 640)
+    monkeypatch.setattr(packing, "CHUNK_PIXELS", 640)
 
     def file(values: np.ndarray) -> h5py.File:
         h5 = h5py.File(tmp_path / "rows.h5", "w")
         h5["plain"] = values
-        packed.pack(h5["plain"], packed.create_packed(h5, "packed", values.shape, values.dtype))
+        packing.pack(h5["plain"], packing.create_packed(h5, "packed", values.shape, values.dtype))
         return h5
 
     return file
@@ -60,7 +60,7 @@ def test_who_reads_row_by_row_has_each_chunk_unpacked_once(write, monkeypatch, m
 
 def test_a_chunk_that_was_never_written_is_zero(write):
     with write(np.ones(SHAPE, np.uint16)) as h5:
-        begun = packed.create_packed(h5, "begun", SHAPE, np.uint16)
+        begun = packing.create_packed(h5, "begun", SHAPE, np.uint16)
         begun[0, 0, :16] = 5
         np.testing.assert_array_equal(read_rows(begun, slice(None)), begun[...])
 
@@ -79,18 +79,18 @@ def test_bytes_that_are_noise_are_stored_and_every_reader_finds_the_values(write
     """Exponents shrink, mantissas do not: to deflate those as well costs most of the time and gains next to nothing."""
     values = np.random.default_rng(2).normal(1.0, 0.1, (3, 2, 64, 40)).astype(np.float32)
     with write(values) as h5:
-        packing = packed.Packing.of(h5["plain"])
-        assert packing.deflated == (False, False, False, True)
+        best = packing.Packing.of(h5["plain"])
+        assert best.deflated == (False, False, False, True)
         _, stream = h5["packed"].id.read_direct_chunk((1, 1, 16, 0))
         # The first bytes of the chunk's values stand in its stream as they are.
         assert values[1, 1, 16:32].tobytes()[::4] in stream
-        every = packed.create_packed(h5, "every", values.shape, np.float32)
-        packed.pack(h5["plain"], every, packed.Packing(1.0, (True,) * 4))
+        every = packing.create_packed(h5, "every", values.shape, np.float32)
+        packing.pack(h5["plain"], every, packing.Packing(1.0, (True,) * 4))
         for name in ("packed", "every"):
             np.testing.assert_array_equal(h5[name][...], values)
             np.testing.assert_array_equal(read_rows(h5[name], slice(None)), values)
         assert h5["packed"].id.get_storage_size() < 1.05 * every.id.get_storage_size()
-        told = h5["plain"].nbytes / packing.ratio
+        told = h5["plain"].nbytes / best.ratio
         assert h5["packed"].id.get_storage_size() == pytest.approx(told, rel=0.15)
 
 
@@ -98,6 +98,6 @@ def test_a_stored_piece_may_be_longer_than_a_block_of_the_stream(tmp_path):
     values = np.random.default_rng(3).integers(0, 1 << 16, (1, 400, 400)).astype(np.uint16)
     with h5py.File(tmp_path / "large.h5", "w") as h5:
         h5["plain"] = values
-        packed.pack(h5["plain"], packed.create_packed(h5, "packed", values.shape, values.dtype))
-        assert packed.Packing.of(h5["plain"]).deflated == (False, False)
+        packing.pack(h5["plain"], packing.create_packed(h5, "packed", values.shape, values.dtype))
+        assert packing.Packing.of(h5["plain"]).deflated == (False, False)
         np.testing.assert_array_equal(h5["packed"][...], values)

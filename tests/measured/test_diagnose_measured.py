@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument_file import extended

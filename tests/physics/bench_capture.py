@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captures.capture_data import CaptureData
+from processing.diagnosis.captures.read_capture import read_capture
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Sample

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captures.capture_data import CaptureData
 from processing.instrument.changes import Conditions
 
 

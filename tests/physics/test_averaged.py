@@ -7,9 +7,9 @@ import pytest
 from bench_capture import bench_capture, read
 from steady_capture import steady_capture
 
-from processing.diagnosis.captured.averaged import averaged
-from processing.diagnosis.captured.capture_data import SharedNoise
-from processing.diagnosis.captured.screening import without_steep_pixels
+from processing.diagnosis.captures.binning import averaged
+from processing.diagnosis.captures.capture_data import SharedNoise
+from processing.diagnosis.captures.screening import without_steep_pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.space import Space

@@ -7,7 +7,7 @@ import pytest
 
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, held_out
-from processing.diagnosis.search.linearized import quadratic
+from processing.diagnosis.search.linearization import quadratic
 from processing.diagnosis.search.posterior import _posterior_of
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Space, Sums

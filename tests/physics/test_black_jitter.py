@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from steady_capture import steady_capture
 
-from processing.diagnosis.captured.noise import black_jitter
+from processing.diagnosis.captures.noise import black_jitter
 
 STATES, SIDE, SIGMA = 20, 60, 1e-4
 

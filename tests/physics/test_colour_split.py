@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captures.read_capture import read_capture
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mosaic.layout import MosaicLayout

@@ -10,7 +10,7 @@ from processing.calibration.robustness import errors_of_table
 from processing.calibration.state_design import AssumedNoise, score
 from processing.commands.application import app
 from processing.errors import ProcessError
-from processing.instrument.determined import determined_basis
+from processing.instrument.determined_basis import determined_basis
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.yaml_file import parse_yaml

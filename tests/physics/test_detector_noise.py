@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from bench_capture import bench_capture
 
-from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.captured.noise import _compare
-from processing.diagnosis.captured.read_capture import read_capture
-from processing.diagnosis.captured.screening import screen_capture
+from processing.diagnosis.captures.capture_data import CaptureData
+from processing.diagnosis.captures.noise import _compare
+from processing.diagnosis.captures.read_capture import read_capture
+from processing.diagnosis.captures.screening import screen_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import compute_residual

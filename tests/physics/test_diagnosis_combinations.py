@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processing.diagnosis.tell.answer import ties
+from processing.diagnosis.verdict.answer import ties
 
 
 def test_a_sum_that_is_known_is_told_and_what_is_known_alone_is_not():

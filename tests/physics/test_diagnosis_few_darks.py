@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bench_capture import bench_capture, read
 
-from processing.diagnosis.captured.screening import without_steep_pixels
+from processing.diagnosis.captures.screening import without_steep_pixels
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.rules import NEEDED

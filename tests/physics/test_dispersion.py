@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from steady_capture import steady_capture
 
-from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.instrument.initial_values import first_values
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.dispersion import curve

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from bench_capture import bench_capture
 
-from processing.diagnosis.captured import averaged
-from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.captured.read_capture import read_capture
-from processing.diagnosis.captured.screening import screen_capture
+from processing.diagnosis.captures import binning
+from processing.diagnosis.captures.capture_data import CaptureData
+from processing.diagnosis.captures.read_capture import read_capture
+from processing.diagnosis.captures.screening import screen_capture
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
-from processing.reduction.left_out import Exclusions
+from processing.reduction.exclusions import Exclusions
 from processing.reduction.mueller import reduce_mueller
 from processing.steps.reduction import Reduction
 from processing.storage.captures.capture import Capture
@@ -103,7 +103,7 @@ def test_cosmic_rays_and_hot_pixels_are_found_and_left_out(configs, tmp_path):
 
 
 def test_hits_are_found_pixel_by_pixel_where_means_are_fitted(configs, tmp_path, monkeypatch):
-    monkeypatch.setattr(averaged, "MOST_FITTED", STATES * SIDE**2 // 4)
+    monkeypatch.setattr(binning, "MOST_FITTED", STATES * SIDE**2 // 4)
     bench = TrueBench(rows=SIDE, columns=SIDE)
 
     def strike(electrons, random):

@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captures.read_capture import read_capture
 from processing.instrument.model import InstrumentModel
 from processing.reduction.stokes import reduce_stokes
 from processing.storage.captures.capture import Capture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bench_capture import bench_capture, read
 
-from processing.diagnosis.captured.screening import screen_capture
+from processing.diagnosis.captures.screening import screen_capture
 from processing.diagnosis.instrument.diagnose import diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.space import Space

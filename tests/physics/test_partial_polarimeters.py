@@ -9,7 +9,7 @@ from processing.calibration.known_sample import part_of
 from processing.calibration.train import fit_trains
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.errors import NotDetermined, ProcessError
-from processing.instrument.determined import determined_basis, determined_elements
+from processing.instrument.determined_basis import determined_basis, determined_elements
 from processing.instrument.model import InstrumentModel, Polarizer
 from processing.maps import xi0 as maps
 from processing.maps.means import mean_of

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from steady_capture import steady_capture
 
-from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.instrument import pixel_sums
 from processing.diagnosis.instrument.features import FEATURES, derivatives_of_part
 from processing.diagnosis.instrument.moments import moments_of
@@ -88,7 +88,7 @@ def test_squares_are_averaged_while_they_are_read(configs, tmp_path, monkeypatch
     counts[4, 8:9, 11:12] = 2**16 - 1
     text = (configs / "instruments/rgb950.yaml").read_text()
     write_capture(tmp_path / "c.h5", bench, counts, angles, sample=Sample(kind="unknown"), instrument=text)
-    monkeypatch.setattr("processing.diagnosis.captured.read_capture.MOST_READ", counts.size / (side - 0.5) ** 2)
+    monkeypatch.setattr("processing.diagnosis.captures.read_capture.MOST_READ", counts.size / (side - 0.5) ** 2)
     with Capture(tmp_path / "c.h5") as capture:
         data = read_capture(capture, InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662))
     assert (data.binned, data.pitch) == (side, side)

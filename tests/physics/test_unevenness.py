@@ -5,8 +5,8 @@ import pytest
 from bench_capture import bench_capture
 from scipy.ndimage import rotate
 
-from processing.diagnosis.captured.read_capture import read_capture
-from processing.diagnosis.captured.screening import without_steep_pixels
+from processing.diagnosis.captures.read_capture import read_capture
+from processing.diagnosis.captures.screening import without_steep_pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.unevenness import Evenness
 from processing.diagnosis.search.fit import minimize

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from steady_capture import steady_capture
 
-from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.instrument.initial_values import along_wavelengths
 from processing.diagnosis.instrument.mueller_error import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem

@@ -11,7 +11,7 @@ from processing.calibration.robustness import ERRORS, errors_of_table
 from processing.calibration.state_design import AssumedNoise, score
 from processing.commands.progress_bar import progress_bar
 from processing.errors import ProcessError
-from processing.instrument.determined import determined_basis
+from processing.instrument.determined_basis import determined_basis
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import StateTable, rotating_retarders
 

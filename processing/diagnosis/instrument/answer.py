@@ -11,7 +11,7 @@ from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import CaptureReport, NoiseReport, NotMeasured
 from processing.diagnosis.search.space import Space
-from processing.diagnosis.tell.answer import error
+from processing.diagnosis.verdict.answer import error
 from processing.instrument.changes import places
 from processing.instrument.model import EffectParameter
 

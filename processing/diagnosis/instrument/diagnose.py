@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from processing.computing.blas import one_blas_thread
-from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.captured.read_capture import read_capture
-from processing.diagnosis.captured.screening import screen_capture
+from processing.diagnosis.captures.capture_data import CaptureData
+from processing.diagnosis.captures.read_capture import read_capture
+from processing.diagnosis.captures.screening import screen_capture
 from processing.diagnosis.instrument.answer import calibrated, capture_report, missing, noise_report, not_measured
 from processing.diagnosis.instrument.doubts import doubts, testable
 from processing.diagnosis.instrument.mueller_error import MuellerErrors, chances, lasts
@@ -28,7 +28,7 @@ from processing.diagnosis.search.names import Names
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, FoundEffect
 from processing.diagnosis.search.rules import FAR_OFF, LIKELY, OUTSTANDING, SHARES
-from processing.diagnosis.tell.answer import Answer, checks, effects_of_switches, unobservable
+from processing.diagnosis.verdict.answer import Answer, checks, effects_of_switches, unobservable
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture, CaptureError
 

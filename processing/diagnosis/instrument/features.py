@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.computing.filters import separable
-from processing.diagnosis.captured.capture_data import SharedNoise
+from processing.diagnosis.captures.capture_data import SharedNoise
 from processing.instrument.changes import STRAIGHT_BELOW
 from processing.reduction.move_image import noise_taps
 

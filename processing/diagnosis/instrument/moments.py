@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array, BoolArray
-from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.instrument.features import FEATURES
 from processing.diagnosis.instrument.pixel_sums import Pixels, Precision, features_of_pixels, products_of_pixels
 from processing.diagnosis.search.rules import TILES

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array, BoolArray
-from processing.diagnosis.captured.capture_data import CaptureData, Correct, for_strips
+from processing.diagnosis.captures.capture_data import CaptureData, Correct, for_strips
 from processing.diagnosis.instrument.photon_noise import exactly_undone, undoing
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.captured.capture_data import CaptureData, Correct
-from processing.diagnosis.captured.noise import LEAST_PART, DetectorNoise, detector_noise, noise_factors
+from processing.diagnosis.captures.capture_data import CaptureData, Correct
+from processing.diagnosis.captures.noise import LEAST_PART, DetectorNoise, detector_noise, noise_factors
 from processing.diagnosis.instrument.features import MARGIN
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.rules import DARK_NOISE_OFF, GAIN_OFF, NOISE_OFF, SHOWN

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array, BoolArray
 from processing.computing.threads import for_ranges
-from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.instrument.features import (
     FEATURES,
     derivatives_of_part,

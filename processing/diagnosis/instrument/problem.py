@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import Moments, folds_of, moments_of
 from processing.diagnosis.instrument.photon_noise import distance, exactly_undone, movable, undoing, with_noise_of_light

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.captured.capture_data import for_strips
+from processing.diagnosis.captures.capture_data import for_strips
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES, derivatives_of_part, features
 from processing.diagnosis.instrument.moments import Block, Moments
 from processing.diagnosis.search.range_of import RANK, range_of

@@ -17,7 +17,7 @@ from processing.diagnosis.instrument.structure import HARMONICS, Residual, harmo
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.range_of import rank_of
 from processing.diagnosis.search.space import Space
-from processing.diagnosis.tell.report import CaptureSection, write_diagnosis_report
+from processing.diagnosis.verdict.report import CaptureSection, write_diagnosis_report
 from processing.polarization.cloude import xi0_and_dominant
 from processing.reports.colours import SIGNED, upper_end
 from processing.reports.figure_style import clipped, png

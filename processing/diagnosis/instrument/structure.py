@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.instrument.features import MARGIN, inside
 from processing.diagnosis.instrument.pixel_sums import Pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
@@ -17,7 +17,7 @@ from processing.diagnosis.instrument.projection import add_response
 from processing.diagnosis.instrument.tiles import tile_columns
 from processing.diagnosis.search.decision import in_deviations, in_words
 from processing.diagnosis.search.fit import Fit
-from processing.diagnosis.search.linearized import deviation_of
+from processing.diagnosis.search.linearization import deviation_of
 from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.rules import FEWEST_OF_MANY, FEWEST_PIXELS, TILES
 from processing.diagnosis.search.space import Space

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import Moments, Tiles
 from processing.diagnosis.instrument.pixel_sums import STRIP_PX, Part, Pixels

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.instrument.initial_values import best_of_starts
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.fit import minimize

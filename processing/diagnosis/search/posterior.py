@@ -24,7 +24,7 @@ from processing.diagnosis.search.descent import (
     next_values,
 )
 from processing.diagnosis.search.likely_set import likely_set
-from processing.diagnosis.search.linearized import group_candidates, noise_of, quadratic
+from processing.diagnosis.search.linearization import group_candidates, noise_of, quadratic
 from processing.diagnosis.search.rules import (
     ALTERNATIVE,
     BENT,

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from processing.arrays import Array
-from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captures.capture_data import CaptureData
+from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.search.rules import FEWEST_OF_MANY, TILES
 from processing.diagnosis.surface.view import SurfaceView
 from processing.errors import ProcessError

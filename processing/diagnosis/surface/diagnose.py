@@ -23,7 +23,7 @@ from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.data import SurfaceData, read_surface
 from processing.diagnosis.surface.problem import OF_INSTRUMENT, SurfaceProblem, structure
 from processing.diagnosis.surface.quantities import SurfaceQuantities, chances, quantities
-from processing.diagnosis.tell.answer import Answer, checks, error, unobservable
+from processing.diagnosis.verdict.answer import Answer, checks, error, unobservable
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
 from processing.polarization.image_difference import rmsd

@@ -12,7 +12,7 @@ from processing.arrays import Array
 from processing.diagnosis.surface.diagnose import SurfaceJudged
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.quantities import dominant_errors, quantities
-from processing.diagnosis.tell.report import CaptureSection, write_diagnosis_report
+from processing.diagnosis.verdict.report import CaptureSection, write_diagnosis_report
 from processing.reports.colours import SIGNED
 from processing.reports.figure_style import png
 from processing.reports.template import Figure

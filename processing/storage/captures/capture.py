@@ -19,7 +19,7 @@ from processing.storage.captures.schema import SCHEMA_VERSION, CaptureHeader
 from processing.storage.captures.segments import Segment, decode_lines, segments_of
 from processing.storage.integrity.checksums import NONE, row_crc32, state_crc32, summed_values
 from processing.storage.integrity.h5_door import OpenH5, closed_if_damaged, damage_as, mark_of, open_h5, text_attribute
-from processing.storage.integrity.unpacked import KeptChunks, is_packed, read_rows
+from processing.storage.integrity.unpacking import KeptChunks, is_packed, read_rows
 from processing.yaml_file import parse_yaml
 
 #: What else a file can be, by its mark.

@@ -9,7 +9,7 @@ import numpy as np
 from processing.storage.captures.capture import Capture, CaptureError
 from processing.storage.captures.schema import STATE_COLUMNS, STATUS_TYPE, create_layout, put_record
 from processing.storage.integrity.checksums import summed_values
-from processing.storage.integrity.packed import SMALL_BYTE_WORTH, Packing, create_packed, pack
+from processing.storage.integrity.packing import SMALL_BYTE_WORTH, Packing, create_packed, pack
 
 
 def pack_capture(path: Path) -> tuple[int, int] | None:

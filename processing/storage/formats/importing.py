@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from processing.doors import one_line, require_place, require_room
-from processing.instrument.measured import NUMBER
+from processing.instrument.measured_matrix import NUMBER
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.frame_layout import Beams

@@ -40,9 +40,9 @@ from processing.storage.integrity.h5_door import (
     require_group,
     text_attribute,
 )
-from processing.storage.integrity.packed import Packing, create_packed, pack
+from processing.storage.integrity.packing import Packing, create_packed, pack
 from processing.storage.integrity.text_heaps import endless_heap
-from processing.storage.integrity.unpacked import KeptChunks, read_rows
+from processing.storage.integrity.unpacking import KeptChunks, read_rows
 from processing.storage.products.provenance import Step as Step
 from processing.storage.products.provenance import file_identity as file_identity
 from processing.storage.products.provenance import jsonable, read_steps, sign, write_steps

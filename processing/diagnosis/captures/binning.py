@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.diagnosis.captured.capture_data import CaptureData, SharedNoise
+from processing.diagnosis.captures.capture_data import CaptureData, SharedNoise
 
 #: [intensities] Of a capture that are fitted; more are averaged over squares of pixels.
 MOST_FITTED = 5_000_000

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from processing.arrays import Array
-from processing.diagnosis.captured.capture_data import CaptureData, SharedNoise
-from processing.diagnosis.captured.outliers import NORMAL_MAD, Whitened
+from processing.diagnosis.captures.capture_data import CaptureData, SharedNoise
+from processing.diagnosis.captures.outliers import NORMAL_MAD, Whitened
 from processing.diagnosis.search.range_of import inside_and_outside, range_of
 from processing.diagnosis.search.rules import (
     DARK_NOISE_OFF,

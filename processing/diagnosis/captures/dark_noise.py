@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.calibration.known_sample import known_mueller
-from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.search.range_of import inside_and_outside
 from processing.diagnosis.search.rules import OUTSTANDING
 from processing.instrument.model import InstrumentModel

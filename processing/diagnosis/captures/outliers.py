@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from processing.arrays import Array
-from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.search.range_of import inside_and_outside, range_of
 from processing.diagnosis.search.rules import FEWEST_OF_MANY, MOSTLY, OUTSTANDING
 

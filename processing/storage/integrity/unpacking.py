@@ -76,7 +76,7 @@ def read_rows(
 
 
 def is_packed(source: h5py.Dataset) -> bool:
-    """Whether it is one of `packed.create_packed`, in this machine's order of bytes."""
+    """Whether it is one of `packing.create_packed`, in this machine's order of bytes."""
     chunk = source.chunks
     if chunk is None or source.compression != "gzip" or not source.shuffle or source.fletcher32:
         return False
