@@ -221,9 +221,9 @@ def dump_yaml(value: BaseModel) -> str:
     yaml.indent(mapping=2, sequence=4, offset=2)
     # A key that is folded over two lines, as one with a capture's name would be, cannot be read back.
     yaml.width = sys.maxsize
-    out = StringIO()
-    yaml.dump(_numbers_in_rows(value.model_dump(mode="json", exclude_none=True)), out)
-    return out.getvalue()
+    buffer = StringIO()
+    yaml.dump(_numbers_in_rows(value.model_dump(mode="json", exclude_none=True)), buffer)
+    return buffer.getvalue()
 
 
 def _numbers_in_rows(node: Any) -> Any:
@@ -256,19 +256,19 @@ def _describe(source: str, tree: CommentedMap, model: type[BaseModel], entries: 
     """A line for each place with a mistake; for a file of another kind only that."""
     kind = [entry for entry in entries if entry["loc"] == ("kind",)]
     names = names_in(model) if any(entry["type"] == "extra_forbidden" for entry in entries) else ()
-    found: dict[str, list[str]] = {}
+    texts_of: dict[str, list[str]] = {}
     for keys, entry in _of_the_type_meant([(_keys(tree, entry), entry) for entry in kind or entries]):
         place = ": ".join(filter(None, (f"{source}:{_line(tree, entry['loc'])}", one_line(".".join(keys)))))
-        found.setdefault(place, []).append(one_line(words_of(entry, names)))
+        texts_of.setdefault(place, []).append(one_line(words_of(entry, names)))
     after = "; is it the right file?" if kind else ""
-    return [f"{place}: {', or '.join(dict.fromkeys(texts))}{after}" for place, texts in found.items()]
+    return [f"{place}: {', or '.join(dict.fromkeys(texts))}{after}" for place, texts in texts_of.items()]
 
 
 def _of_the_type_meant(entries: Sequence[tuple[tuple[str, ...], Any]]) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Leave out that keys or a list are no number, say, where they could be so, and have a mistake of their own."""
-    own = [keys for keys, entry in entries if not _wrong_type(entry)]
+    mistakes = [keys for keys, entry in entries if not _wrong_type(entry)]
     for keys, entry in entries:
-        if not _wrong_type(entry) or not any(other[: len(keys)] == keys for other in own):
+        if not _wrong_type(entry) or not any(mistake[: len(keys)] == keys for mistake in mistakes):
             yield keys, entry
 
 

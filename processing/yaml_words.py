@@ -107,8 +107,8 @@ def words_of(entry: Any, names: Sequence[str] = ()) -> str:
         return "may have letters, digits, - and _ only" + _value_text(kind, entry)
     if kind in WORDS:
         return WORDS[kind].format_map(entry.get("ctx", {})) + _value_text(kind, entry)
-    stem, _, rest = kind.partition("_")
-    if stem in TYPES and rest in ("type", "parsing", "parsing_size", "attributes_type"):
+    stem, _, suffix = kind.partition("_")
+    if stem in TYPES and suffix in ("type", "parsing", "parsing_size", "attributes_type"):
         return f"must be {TYPES[stem]}" + _value_text(kind, entry)
     return str(entry["msg"]).removeprefix("Value error, ")
 

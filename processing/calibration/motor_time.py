@@ -52,11 +52,11 @@ def periods_deg(model: InstrumentModel) -> dict[str, float]:
     random = np.random.default_rng(0)
     angles = {axis: random.uniform(0, 360, 8) for axis in model.axes}
     rows = model.rows(angles)
-    out = {}
+    periods = {}
     for axis in model.axes:
         half = model.rows(angles | {axis: angles[axis] + 180})
-        out[axis] = 180.0 if np.allclose(half, rows, atol=1e-9) else 360.0
-    return out
+        periods[axis] = 180.0 if np.allclose(half, rows, atol=1e-9) else 360.0
+    return periods
 
 
 def unwound(angles: Array, periods: Array) -> Array:

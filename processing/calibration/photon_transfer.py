@@ -169,14 +169,14 @@ def _pairs(captures: Sequence[Capture], default: Black) -> Iterator[tuple[NDArra
 def bad_pixels(capture: Capture) -> NDArray[np.bool_]:
     """Pixels (rows, columns) whose dark signal lies far from the others'; none without dark states."""
     black = Black.of(capture)
-    out = np.zeros(capture.frame_shape, dtype=bool)
+    bad = np.zeros(capture.frame_shape, dtype=bool)
     # Hot pixels show best in the longest darks.
     for channel in () if black is None else black.means[-1]:
         centre = np.median(channel)
         spread = 1.4826 * np.median(np.abs(channel - centre))
         # Whole counts can make the spread vanish; a count is the least that means anything.
-        out |= np.abs(channel - centre) > OUTLIER * max(float(spread), 0.3)
-    return out
+        bad |= np.abs(channel - centre) > OUTLIER * max(float(spread), 0.3)
+    return bad
 
 
 def write_camera(
@@ -234,13 +234,13 @@ def read_camera(path: Path) -> tuple[NoiseModel, NDArray[np.bool_]]:
 
 
 def _warnings(line: PhotonTransfer, capture: Capture) -> list[str]:
-    out = []
+    warnings = []
     if line.chi_square > 3:
-        out.append(
+        warnings.append(
             f"the variance does not follow a straight line (reduced chi-square {line.chi_square:.1f}): the camera "
             "is not linear there, or the scene changed between repeats"
         )
     stated = capture.header.detector.gain_e_per_count
     if stated is not None and abs(line.gain_e_per_count - stated) > 5 * line.gain_stderr + 0.02 * stated:
-        out.append(f"the capture's header says {stated:g} e/count, the frames say {line.gain_e_per_count:.4g}")
-    return out
+        warnings.append(f"the capture's header says {stated:g} e/count, the frames say {line.gain_e_per_count:.4g}")
+    return warnings

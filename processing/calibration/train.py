@@ -251,14 +251,14 @@ class _Fit:
         pulled = np.split(np.sum(u[:, singular > UNSEEN * singular[0]] ** 2, axis=1), self._edges)
         residuals = np.split(minimum.fun, self._edges)
         wavelengths = np.array(_wavelengths(self.parts))
-        out = np.empty(len(self.parts))
+        units = np.empty(len(self.parts))
         for nm in np.unique(wavelengths):
             index = np.flatnonzero(wavelengths == nm).tolist()
             square = sum(float(np.sum(residuals[k] ** 2)) for k in index)
             free = sum(self.parts[k].data.size - self.parts[k].throughputs - float(pulled[k].sum()) for k in index)
             total = float(np.sum(minimum.fun**2)) / self.freedom
-            out[index] = max(np.sqrt(square / free if free >= 1 else total), LEAST_RESIDUAL)
-        return out
+            units[index] = max(np.sqrt(square / free if free >= 1 else total), LEAST_RESIDUAL)
+        return units
 
     def covariance(self, minimum: Any) -> NDArray[np.float64]:
         """(U, U) of what is searched.
@@ -284,18 +284,18 @@ class _Fit:
     def calibrations(self, minimum: Any) -> list[Calibration]:
         """One for each part."""
         covariance = self.covariance(minimum)
-        out = []
+        calibrations = []
         for part, matrix in zip(self.parts, self._matrices, strict=True):
             fitted = _fit_values(self.shared, part.model, matrix, minimum.x, covariance=covariance)
             residual = part.residual(fitted.model)
-            out.append(
+            calibrations.append(
                 Calibration(
                     **vars(fitted),
                     residual_over_mean=float(np.sqrt(np.mean(residual**2))),
                     residual=residual.reshape(*part.signal.shape[:2], -1).mean(axis=2),
                 )
             )
-        return out
+        return calibrations
 
     def _derivative(self, part: KnownCapture, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N * channels * pixels, K) of the residual by the values of a part."""

@@ -131,17 +131,17 @@ class TrainValues:
         CalibrationError : the wavelength is outside the curve, or a value is known at the captures' wavelengths alone.
         """
         terms = None if self.curve is None else self.curve.terms(wavelength_nm)
-        out = np.zeros((len(self.names), len(self.unknown)))
+        matrix = np.zeros((len(self.names), len(self.unknown)))
         for column, unknown in enumerate(self.unknown):
             row = self.names.index(unknown.name)
             if unknown.term is not None and terms is not None:
-                out[row, column] = terms[unknown.term]
+                matrix[row, column] = terms[unknown.term]
             elif unknown.wavelength_nm in (None, wavelength_nm):
-                out[row, column] = 1.0
-        open_ones = [name for name, row in zip(self.names, out, strict=True) if not row.any()]
+                matrix[row, column] = 1.0
+        open_ones = [name for name, row in zip(self.names, matrix, strict=True) if not row.any()]
         if open_ones:
             raise CalibrationError(f"{', '.join(open_ones)}: no value at {wavelength_nm:g} nm follows from the others")
-        return out
+        return matrix
 
     def nearest(
         self,

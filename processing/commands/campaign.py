@@ -216,21 +216,21 @@ def lines(result: CampaignResult, with_paper: bool) -> list[str]:
         cells = [f"{'' if v is None else '-' if v != v else f'{v:.3f}':>11}" for v in values]
         return f"  {head:>5} {' '.join(cells)}".rstrip()
 
-    out = ["RMSD, and the part of it that the noise of the captures makes (first order)"]
+    lines = ["RMSD, and the part of it that the noise of the captures makes (first order)"]
     for nm in sorted({r.wavelength_nm for r in result.rows}):
-        out.append(f"{nm:g} nm")
-        out.append("  Omega " + " ".join(f"{label:>11}" for _, label in COLUMNS))
+        lines.append(f"{nm:g} nm")
+        lines.append("  Omega " + " ".join(f"{label:>11}" for _, label in COLUMNS))
         for r in (r for r in result.rows if r.wavelength_nm == nm):
-            out.append(row(f"{r.omega_deg:g}", [getattr(r, name) for name, _ in COLUMNS]))
-        out.append(row("mean", [result.average(nm, name) for name, _ in COLUMNS]))
+            lines.append(row(f"{r.omega_deg:g}", [getattr(r, name) for name, _ in COLUMNS]))
+        lines.append(row("mean", [result.average(nm, name) for name, _ in COLUMNS]))
         if with_paper and round(nm) in PAPER:
             p = PAPER[round(nm)]
-            out.append(row("paper", [p.psi_deg, None, p.magnitude_percent, None, p.xi0_percent]))
-    out.append(
+            lines.append(row("paper", [p.psi_deg, None, p.magnitude_percent, None, p.xi0_percent]))
+    lines.append(
         "common: part of the virtual sphere where both instruments have a value; eigenvalues: 99th percentile of "
         "the largest deviation of xi1..xi3 from their mean, without its noise; -: no capture for it"
     )
-    return out
+    return lines
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -35,11 +35,11 @@ def dot(a: ArrayLike, b: ArrayLike) -> Array:
 def cross(a: ArrayLike, b: ArrayLike) -> Array:
     """Vector products (..., 3) over the last axis (several times faster than numpy's general one)."""
     u, v = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
-    out = np.empty(u.shape)
-    out[..., 0] = u[..., 1] * v[..., 2] - u[..., 2] * v[..., 1]
-    out[..., 1] = u[..., 2] * v[..., 0] - u[..., 0] * v[..., 2]
-    out[..., 2] = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
-    return out
+    product = np.empty(u.shape)
+    product[..., 0] = u[..., 1] * v[..., 2] - u[..., 2] * v[..., 1]
+    product[..., 1] = u[..., 2] * v[..., 0] - u[..., 0] * v[..., 2]
+    product[..., 2] = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+    return product
 
 
 @dataclass(frozen=True)
@@ -120,9 +120,9 @@ class GeometryImage:
     def fill(self, values: ArrayLike, outside: float = np.nan) -> NDArray[np.floating]:
         """Image (rows, columns, ...) of values (N, ...); `outside` elsewhere."""
         v = np.asarray(values)
-        out = np.full((*self.mask.shape, *v.shape[1:]), outside, dtype=v.dtype)
-        out[self.mask] = v
-        return out
+        image = np.full((*self.mask.shape, *v.shape[1:]), outside, dtype=v.dtype)
+        image[self.mask] = v
+        return image
 
 
 def transverse_axes(k: Array, up: Array = WORLD_UP) -> tuple[Array, Array]:

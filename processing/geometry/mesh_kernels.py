@@ -28,8 +28,8 @@ def _meet_at_once(
         points[part] = origin + t[:, None] * ray
         away = corners - points[part, None]
         area = np.cross(np.roll(away, -1, axis=1), np.roll(away, -2, axis=1))
-        found = np.einsum("nki,ni,nkj->nj", area, normal, corner_normals[f])
-        normals[part] = found / np.linalg.norm(found, axis=1, keepdims=True)
+        sums = np.einsum("nki,ni,nkj->nj", area, normal, corner_normals[f])
+        normals[part] = sums / np.linalg.norm(sums, axis=1, keepdims=True)
 
 
 @compiled(_meet_at_once, error_model="numpy")

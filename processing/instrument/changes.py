@@ -143,22 +143,22 @@ class Changes:
         def among(x: Array) -> Array:
             return x[chosen] if np.ndim(x) and len(x) == states else x
 
-        out = copy(self)
-        out.conditions = replace(
+        subset = copy(self)
+        subset.conditions = replace(
             c,
             angles_deg={axis: angle[chosen] for axis, angle in c.angles_deg.items()},
             states=len(chosen),
             elapsed=c.elapsed[chosen],
             run=c.run[chosen],
         )
-        out.gain, out.shift_px, out.blur_px2 = self.gain[chosen], self.shift_px[chosen], self.blur_px2[chosen]
-        out.stray = among(np.asarray(self.stray))
-        out.after = {key: among(x) if np.ndim(x) == 3 else x for key, x in self.after.items()}
-        out.before = {key: among(x) if np.ndim(x) == 3 else x for key, x in self.before.items()}
+        subset.gain, subset.shift_px, subset.blur_px2 = self.gain[chosen], self.shift_px[chosen], self.blur_px2[chosen]
+        subset.stray = among(np.asarray(self.stray))
+        subset.after = {key: among(x) if np.ndim(x) == 3 else x for key, x in self.after.items()}
+        subset.before = {key: among(x) if np.ndim(x) == 3 else x for key, x in self.before.items()}
         for name in ("azimuth_rad", "retardance_rad", "response"):
             of_all = getattr(self, name)
-            setattr(out, name, defaultdict(of_all.default_factory, {key: among(x) for key, x in of_all.items()}))
-        return out
+            setattr(subset, name, defaultdict(of_all.default_factory, {key: among(x) for key, x in of_all.items()}))
+        return subset
 
     def key(self, element: str, azimuth_rad: Array) -> tuple[str, bytes]:
         """What the Mueller matrices of an element depend on, its own values left out."""

@@ -109,14 +109,14 @@ LABEL = re.compile(
 
 def _direction_text(direction: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, float | str]]:
     """The values of effects (as mappings of their fields) by label; values of many states in one text."""
-    out: dict[str, dict[str, float | str]] = {}
+    texts: dict[str, dict[str, float | str]] = {}
     for effect in direction:
         values = {name: _number_or_text(p["value"]) for name, p in effect["parameters"].items()}
         label = effect["kind"] + (f"[{effect['element']}]" if effect["element"] else "")
         label += f" at {effect['wavelength_nm']:g} nm" if effect["wavelength_nm"] is not None else ""
         captures = [f" in {name}" for name in effect["captures"]] if effect["scope"] == "capture" else [""]
-        out |= {label + where: values for where in captures}
-    return out
+        texts |= {label + where: values for where in captures}
+    return texts
 
 
 def _read_direction(direction: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -126,7 +126,7 @@ def _read_direction(direction: Mapping[str, Mapping[str, Any]]) -> list[dict[str
     ------
     ValueError : a label is none, or a text has no numbers.
     """
-    out = []
+    effects = []
     for label, values in direction.items():
         place = LABEL.fullmatch(label)
         if place is None:
@@ -140,8 +140,8 @@ def _read_direction(direction: Mapping[str, Mapping[str, Any]]) -> list[dict[str
             fields |= {"captures": (place["capture"],), "scope": "capture"}
         # The unit is that of the effect: nobody reads it here.
         fields["parameters"] = {name: {"value": _numbers(value), "unit": ""} for name, value in values.items()}
-        out.append(fields)
-    return out
+        effects.append(fields)
+    return effects
 
 
 def _number_or_text(value: float | Sequence[float]) -> float | str:

@@ -60,9 +60,9 @@ OF_THE_IMAGE = (("blur",), ("brightness right", "brightness down"))
 
 
 def _unit(i: int, j: int) -> Array:
-    out = np.zeros((4, 4))
-    out[i, j] = 1.0
-    return out
+    matrix = np.zeros((4, 4))
+    matrix[i, j] = 1.0
+    return matrix
 
 
 #: Generators of a Mueller matrix in the frame of an element.
@@ -130,13 +130,13 @@ class Sentence:
     def parameters(self, conditions: Conditions) -> tuple[Parameter, ...]:
         """One for each quantity and each part of the course."""
         names = _course_names(self.course)
-        out = []
+        parameters = []
         for quantity in self.quantities:
             unit, size = SIZES[quantity]
             for name in names:
                 full = "_".join(x for x in (quantity.replace(" ", "_") if len(self.quantities) > 1 else "", name) if x)
-                out.append(Parameter(full or "value", unit, -REACH * size, REACH * size, size))
-        return tuple(out)
+                parameters.append(Parameter(full or "value", unit, -REACH * size, REACH * size, size))
+        return tuple(parameters)
 
     def apply(self, changes: Changes, model: InstrumentModel, values: Array) -> None:
         """Add the sentence with these values to the changes."""
@@ -253,37 +253,37 @@ def _bend(changes: Changes, model: InstrumentModel, site: str, quantity: str, *,
 
 
 def _exponential(a: Array) -> Array:
-    out = term = np.broadcast_to(np.eye(4), a.shape)
+    total = term = np.broadcast_to(np.eye(4), a.shape)
     for k in (1, 2, 3, 4):
         term = term @ a / k
-        out = out + term
-    return np.asarray(out)
+        total = total + term
+    return np.asarray(total)
 
 
 def sentences(model: InstrumentModel, conditions: Conditions) -> tuple[Sentence, ...]:
     """All that can be said of an instrument in these conditions, beside what has a name."""
     turning = [axis for axis in model.axes if _turns(conditions, axis)]
     times = TIMES if conditions.states >= FEWEST_STATES else ()
-    out: list[Sentence] = []
+    result: list[Sentence] = []
     passed: list[str] = []
     for element in model.generator:
-        out += _of_element(element, turning, passed, times, front=True)
+        result += _of_element(element, turning, passed, times, front=True)
     if len(model.generator) > 1:
-        out += _of_path(passed, times)
+        result += _of_path(passed, times)
     states = conditions.states if times else 0
     for element in model.analyzer:
-        out += _of_element(element, turning, passed, times, front=False)
+        result += _of_element(element, turning, passed, times, front=False)
         if not isinstance(element, Retarder):
-            out += _jumps(element.name, "azimuth", states)
-    out += _of_source_and_detector(states, times, turning)
+            result += _jumps(element.name, "azimuth", states)
+    result += _of_source_and_detector(states, times, turning)
     # Once a turn it has a name.
-    out += _waves("image", SHIFT, turning, (2,))
+    result += _waves("image", SHIFT, turning, (2,))
     for quantities in OF_THE_IMAGE:
-        out += _waves("image", quantities, turning, (1, 2))
-        out += [Sentence("image", quantities, time) for time in times[:1]]
+        result += _waves("image", quantities, turning, (1, 2))
+        result += [Sentence("image", quantities, time) for time in times[:1]]
     if states > 2 * MODES:
-        out.append(Sentence("source", ("gain",), "wandering"))
-    return tuple(dict.fromkeys(out))
+        result.append(Sentence("source", ("gain",), "wandering"))
+    return tuple(dict.fromkeys(result))
 
 
 def _turns(conditions: Conditions, axis: str) -> bool:

@@ -55,7 +55,7 @@ def influences(
     nm = wavelength_nm or (*(model.wavelengths_nm or ()), *wavelengths, 0.0)[0]
     at = model.at(nm)
     where = conditions or _some_states(at, STATES)
-    out = []
+    result = []
     for name, stderr in model.stderr.items():
         step = at.stderr.get(name, 0.0)
         shift = AppliedEffect(
@@ -63,11 +63,11 @@ def influences(
         )
         change = _change(at, (*at.effects, shift), at.effects, where)
         value = _numbers(model.value_of(name), stderr)
-        out.append(Influence(name, value, "later captures at all wavelengths", change, fitted=True))
+        result.append(Influence(name, value, "later captures at all wavelengths", change, fitted=True))
     for effect in model.effects:
         model_at = at if wavelength_nm or effect.wavelength_nm is None else model.at(effect.wavelength_nm)
-        out.append(Influence(_name(effect), _values(effect), _scope(effect), _change_by(model_at, effect, where)))
-    return out
+        result.append(Influence(_name(effect), _values(effect), _scope(effect), _change_by(model_at, effect, where)))
+    return result
 
 
 def _change_by(model: InstrumentModel, effect: AppliedEffect, where: Conditions) -> float | None:

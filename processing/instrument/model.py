@@ -282,15 +282,15 @@ class InstrumentModel(Section):
         """Analyzer vectors a (states, channels, 4): first row of each channel's train."""
         n = _state_count(angles_deg, changes)
         common = [_matrices(e, angles_deg, n, changes) for e in self.analyzer]
-        out = np.empty((n, len(self.channels), 4))
+        vectors = np.empty((n, len(self.channels), 4))
         for k, channel in enumerate(self.channels):
             matrices = [_matrices(e, angles_deg, n, changes) for e in channel.elements]
             row = np.zeros((n, 4))
             row[:, 0] = number(channel.gain)
             for matrix in reversed(common + matrices):
                 row = np.einsum("ni,nij->nj", row, matrix)
-            out[:, k] = row
-        return out
+            vectors[:, k] = row
+        return vectors
 
     def rows(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Array:
         """Measurement matrix W (states, channels, 16): row = kron(a, g), so that P = W . vec(M), row-major.

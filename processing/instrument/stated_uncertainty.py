@@ -38,9 +38,9 @@ class Correlation(Section):
     @property
     def matrix(self) -> Array:
         """(K, K), symmetric, 1 on the diagonal."""
-        out = np.zeros((len(self.between),) * 2)
-        out[np.tril_indices(len(out), -1)] = self.coefficients
-        return np.asarray(out + out.T + np.eye(len(out)))
+        matrix = np.zeros((len(self.between),) * 2)
+        matrix[np.tril_indices(len(matrix), -1)] = self.coefficients
+        return np.asarray(matrix + matrix.T + np.eye(len(matrix)))
 
 
 def without_u(node: Any, errors: dict[str, Any]) -> Any:

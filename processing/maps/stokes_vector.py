@@ -109,14 +109,14 @@ def light_block(product: Product, rows: slice, systematic: Systematic | None = N
     matrices = MuellerImage.of(product, rows)
     image = light_of(matrices, product.get("stokes_errors", rows) if "stokes" in product.names else None)
     moves = None if systematic is None else moves_of_light(systematic, matrices)
-    out: dict[str, NDArray[Any]] = {"stokes": image.values[:, 0], "stokes_errors": image.errors[:, 0]}
+    planes: dict[str, NDArray[Any]] = {"stokes": image.values[:, 0], "stokes_errors": image.errors[:, 0]}
     covariance = image.covariance()[..., ::4, ::4]
     is_determined = image.is_determined[::4]
     covariance = np.where(np.outer(is_determined, is_determined), covariance, np.nan)
-    out["stokes_covariance"] = np.moveaxis(covariance[..., _PACKED[0], _PACKED[1]], -1, 0).astype(np.float32)
+    planes["stokes_covariance"] = np.moveaxis(covariance[..., _PACKED[0], _PACKED[1]], -1, 0).astype(np.float32)
     if moves is not None:
-        out["stokes_systematic"] = np.sqrt(np.square(moves[:, ::4]).sum(axis=0)).astype(np.float32)
-    return out | named(partial_block(image, light_quantities(image.is_determined), {}, moves))
+        planes["stokes_systematic"] = np.sqrt(np.square(moves[:, ::4]).sum(axis=0)).astype(np.float32)
+    return planes | named(partial_block(image, light_quantities(image.is_determined), {}, moves))
 
 
 def named(planes: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

@@ -83,15 +83,15 @@ class Black:
         if len(self.exposure_s) == 1:
             return np.ones((len(exposure), 1))
         number = self.frames / self.frames.sum()
-        out = np.broadcast_to(number, (len(exposure), len(number))).copy()
+        weights = np.broadcast_to(number, (len(exposure), len(number))).copy()
         is_known = ~np.isnan(exposure)
         line = np.stack([np.ones_like(self.exposure_s), self.exposure_s], axis=1)
         fit = np.linalg.solve((line.T * number) @ line, line.T * number)
-        out[is_known] = np.stack([np.ones(is_known.sum()), exposure[is_known]], axis=1) @ fit
+        weights[is_known] = np.stack([np.ones(is_known.sum()), exposure[is_known]], axis=1) @ fit
         near = np.abs(exposure[:, None] - self.exposure_s)
         exact = is_known & self.matches(exposure)
-        out[exact] = np.eye(len(number))[np.argmin(near[exact], axis=1)]
-        return out
+        weights[exact] = np.eye(len(number))[np.argmin(near[exact], axis=1)]
+        return weights
 
     def at(self, exposure_s: float) -> NDArray[np.float32]:
         """Black (channels, rows, columns) of one exposure; (1, 1, 1) for a declared level."""

@@ -193,18 +193,18 @@ class BlockReader:
 
     def _struck_in(self, rows: slice, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
         """(states, channels, pixels) of a row block; None for none."""
-        mine = self._all_struck[(self._all_struck[:, 2] >= rows.start) & (self._all_struck[:, 2] < rows.stop)]
-        if not len(mine):
+        struck = self._all_struck[(self._all_struck[:, 2] >= rows.start) & (self._all_struck[:, 2] < rows.stop)]
+        if not len(struck):
             return None
-        out = np.zeros(shape, dtype=bool)
-        out[mine[:, 0], mine[:, 1], mine[:, 2] - rows.start, mine[:, 3]] = True
-        return out.reshape(*shape[:2], -1)
+        mask = np.zeros(shape, dtype=bool)
+        mask[struck[:, 0], struck[:, 1], struck[:, 2] - rows.start, struck[:, 3]] = True
+        return mask.reshape(*shape[:2], -1)
 
     def sound(self, raw: NDArray[np.generic], pixels: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which intensities (states, channels, pixels) of the block count: neither saturated nor struck."""
         level = self.correction.saturation
-        out = np.ones(raw.shape, dtype=bool) if level is None else np.less(raw, level)
-        return out if self._struck is None else out & ~self._struck[:, :, pixels]
+        is_sound = np.ones(raw.shape, dtype=bool) if level is None else np.less(raw, level)
+        return is_sound if self._struck is None else is_sound & ~self._struck[:, :, pixels]
 
     def _read_moved(self, rows: slice, block: NDArray[np.generic], counts: CountsCorrection) -> None:
         """Fill `block` with counts of images moved back; beyond an edge of the frame slopes go on.

@@ -102,9 +102,9 @@ def with_extra(changes: Changes, extra: NDArray[np.float64]) -> Changes:
     retardance = defaultdict(lambda: np.zeros(()), changes.retardance_rad)
     for element, value in zip(changes.field_retardance_rad, extra, strict=True):
         retardance[element] = retardance[element] + float(value)
-    out = copy(changes)
-    out.retardance_rad = retardance
-    return out
+    shifted = copy(changes)
+    shifted.retardance_rad = retardance
+    return shifted
 
 
 def counts_correction(changes: Changes | None, model: InstrumentModel) -> CountsCorrection | None:
@@ -112,8 +112,8 @@ def counts_correction(changes: Changes | None, model: InstrumentModel) -> Counts
     if changes is None:
         return None
     response = {name: np.asarray(value, dtype=float) for name, value in changes.response.items() if np.any(value)}
-    out = CountsCorrection(changes.conditions.full_scale, response, changes.shift_px, model.pitch, changes.blur_px2)
-    return out if response or out.moves else None
+    counts = CountsCorrection(changes.conditions.full_scale, response, changes.shift_px, model.pitch, changes.blur_px2)
+    return counts if response or counts.moves else None
 
 
 #: Features by which counts are corrected.

@@ -53,10 +53,10 @@ class Exclusions:
             entries = [_Entry.model_validate(entry) for entry in result["left_out"]]
         except (KeyError, TypeError, ValidationError) as error:
             raise ProcessError(f"{path} is no result of `diagnose --json` that tells what was left out.") from error
-        mine = [entry for entry in entries if entry.capture == capture.name]
-        if not mine:
+        own_entries = [entry for entry in entries if entry.capture == capture.name]
+        if not own_entries:
             return cls()
-        (entry,) = mine
+        (entry,) = own_entries
         height, width = capture.frame_shape
         # Of a capture that is read super-pixel by super-pixel one pixel is as many of the sensor.
         mosaic = capture.header.mosaic

@@ -380,8 +380,8 @@ def _numbers_again(capture: Capture) -> list[FrameFinding]:
     for kind, name, quantity in columns:
         values = capture.column(name)
         for run in np.unique(capture.run_of_states):
-            mine = np.flatnonzero((capture.run_of_states == run) & (values != 0))
-            again = mine[1:][values[mine[1:]] == values[mine[:-1]]]
+            index = np.flatnonzero((capture.run_of_states == run) & (values != 0))
+            again = index[1:][values[index[1:]] == values[index[:-1]]]
             if again.size:
                 state = int(capture.done[again[0]])
                 text = f"{again.size} states have the {quantity} of the state before, the first of them state {state}"

@@ -306,6 +306,6 @@ def _blank(planes: Mapping[str, NDArray[Any]], lost: NDArray[np.bool_], unseen: 
 
 def _renumber_hits(hits: NDArray[np.int64], every: NDArray[np.int64], states: NDArray[np.int64]) -> NDArray[np.int64]:
     """Hits (H, 4) in `states`, their state counted among `states` and no longer among `every`."""
-    out = hits[np.isin(every[hits[:, 0]], states)]
-    out[:, 0] = np.searchsorted(states, every[out[:, 0]])
-    return out
+    renumbered = hits[np.isin(every[hits[:, 0]], states)]
+    renumbered[:, 0] = np.searchsorted(states, every[renumbered[:, 0]])
+    return renumbered

@@ -276,11 +276,11 @@ def _spread(mask: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8
         return mask
     from scipy.ndimage import maximum_filter
 
-    out = np.zeros_like(mask)
+    flags = np.zeros_like(mask)
     for flag in Mask:
         bit = np.uint8(flag)
-        out |= maximum_filter(mask & bit, 3)
-    return out
+        flags |= maximum_filter(mask & bit, 3)
+    return flags
 
 
 def _facts(

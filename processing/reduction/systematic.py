@@ -91,14 +91,14 @@ class Systematic:
             return np.asarray(basis @ np.linalg.pinv(w.reshape(-1, len(basis)) @ basis))
 
         w = matrix(model)[1]
-        flat, out, count = w.reshape(-1, len(basis)), [], Counter[str]()
+        flat, directions, count = w.reshape(-1, len(basis)), [], Counter[str]()
         for name, u, variant, bent in moved:
             rows, analyzers = matrix(variant)
             turn = inverse(analyzers) @ flat - basis @ basis.T
             count[name] += 1
             label = f"{name}{f' {count[name]}' if count[name] > 1 else ''} ({model.identity})"
-            out.append(Direction(label, u, turn, rows.reshape(-1, 16), bent))
-        return cls(tuple(out), flat, inverse(w), w.shape[1])
+            directions.append(Direction(label, u, turn, rows.reshape(-1, 16), bent))
+        return cls(tuple(directions), flat, inverse(w), w.shape[1])
 
     def store(self, product: ProductWriter) -> dict[str, str]:
         """Put the directions into a product; returns the fact that names them."""
@@ -118,10 +118,10 @@ class Systematic:
 
     def _coefficients(self, counts: CountsCorrection | None) -> Array:
         """(features, states, channels)."""
-        out = np.zeros((len(FEATURES), len(self.w) // self.channels, self.channels))
+        coefficients = np.zeros((len(FEATURES), len(self.w) // self.channels, self.channels))
         for name, value in counts.response.items() if counts is not None else ():
-            out[FEATURES.index(name)] = value
-        return out
+            coefficients[FEATURES.index(name)] = value
+        return coefficients
 
     @classmethod
     def of_product(cls, product: Product) -> "Systematic | None":

@@ -69,21 +69,21 @@ def normalized_mueller(jones: ComplexArray) -> Array:
     j00, j01, j10, j11 = (jones[..., i, k] for i in (0, 1) for k in (0, 1))
     a, b, c, d = (z.real**2 + z.imag**2 for z in (j00, j01, j10, j11))
     scale = 2.0 / (a + b + c + d)
-    out = np.empty((*j00.shape, 4, 4))
-    out[..., 0, 0] = 1.0
-    out[..., 0, 1] = 0.5 * scale * (a - b + c - d)
-    out[..., 1, 0] = 0.5 * scale * (a + b - c - d)
-    out[..., 1, 1] = 0.5 * scale * (a - b - c + d)
+    mueller = np.empty((*j00.shape, 4, 4))
+    mueller[..., 0, 0] = 1.0
+    mueller[..., 0, 1] = 0.5 * scale * (a - b + c - d)
+    mueller[..., 1, 0] = 0.5 * scale * (a + b - c - d)
+    mueller[..., 1, 1] = 0.5 * scale * (a - b - c + d)
     top, bottom = j00 * j01.conj(), j10 * j11.conj()
-    out[..., 0, 2], out[..., 0, 3] = scale * (top + bottom).real, -scale * (top + bottom).imag
-    out[..., 1, 2], out[..., 1, 3] = scale * (top - bottom).real, -scale * (top - bottom).imag
+    mueller[..., 0, 2], mueller[..., 0, 3] = scale * (top + bottom).real, -scale * (top + bottom).imag
+    mueller[..., 1, 2], mueller[..., 1, 3] = scale * (top - bottom).real, -scale * (top - bottom).imag
     first, second = j00 * j10.conj(), j01 * j11.conj()
-    out[..., 2, 0], out[..., 3, 0] = scale * (first + second).real, scale * (first + second).imag
-    out[..., 2, 1], out[..., 3, 1] = scale * (first - second).real, scale * (first - second).imag
+    mueller[..., 2, 0], mueller[..., 3, 0] = scale * (first + second).real, scale * (first + second).imag
+    mueller[..., 2, 1], mueller[..., 3, 1] = scale * (first - second).real, scale * (first - second).imag
     diagonal, anti = j00 * j11.conj(), j01 * j10.conj()
-    out[..., 2, 2], out[..., 3, 3] = scale * (diagonal + anti).real, scale * (diagonal - anti).real
-    out[..., 3, 2], out[..., 2, 3] = scale * (diagonal + anti).imag, scale * (anti - diagonal).imag
-    return out
+    mueller[..., 2, 2], mueller[..., 3, 3] = scale * (diagonal + anti).real, scale * (diagonal - anti).real
+    mueller[..., 3, 2], mueller[..., 2, 3] = scale * (diagonal + anti).imag, scale * (anti - diagonal).imag
+    return mueller
 
 
 @cache

@@ -111,15 +111,15 @@ class MaterialFit:
 
     @property
     def _doubts(self) -> list[str]:
-        out = []
+        doubts = []
         if not self.describes:
-            out.append(f"THE MODEL DOES NOT DESCRIBE THESE DATA: reduced chi-square {self.chi_square:.3g}")
+            doubts.append(f"THE MODEL DOES NOT DESCRIBE THESE DATA: reduced chi-square {self.chi_square:.3g}")
         apart = f"small eigenvalues {250 * DEPARTURE:.0f} % apart, which a Mueller image does not have"
         for source, part in ((apart, self.departure), ("the instrument's uncertainty", self.systematic)):
             if part.any():
                 by = ", ".join(f"{n} {e:.2g}" for n, e in zip(self.names, np.sqrt(np.diag(part)), strict=True))
-                out.append(f"of these, {source}: {by}")
-        return out
+                doubts.append(f"of these, {source}: {by}")
+        return doubts
 
     def model(self, name: str, wavelength_nm: float) -> BaseModel:
         """The fitted reflectance model."""

@@ -219,7 +219,7 @@ def fill_bins(table: ScatteringTable, values: Array, white_m00: float, empty: st
     np.divide(1.0, per, out=scale, where=visible, casting="unsafe")
     scale[~visible | (row < 0)] = np.nan
     mean = values.astype(np.float32)
-    out = np.empty((*SHAPE[::-1], 16), dtype=np.float32)
+    array = np.empty((*SHAPE[::-1], 16), dtype=np.float32)
     for q in range(16):
-        out[..., q] = (mean[q][row] * scale).transpose(2, 1, 0)
-    return out.reshape(*SHAPE[::-1], 4, 4), gaps
+        array[..., q] = (mean[q][row] * scale).transpose(2, 1, 0)
+    return array.reshape(*SHAPE[::-1], 4, 4), gaps

@@ -25,10 +25,10 @@ def diffuse_jones(geometry: ScatteringGeometry) -> ComplexArray:
     """diag(1, -1) R(phi_d) diag(1, 0) R(-phi_d), (..., 2, 2); radial about the point where theta_h = 0."""
     phi = geometry.angles.phi_d
     c, s = np.cos(phi), np.sin(phi)
-    out = np.empty((*phi.shape, 2, 2), dtype=complex)
-    out[..., 0, 0], out[..., 0, 1] = c * c, c * s
-    out[..., 1, 0], out[..., 1, 1] = -c * s, -s * s
-    return out
+    jones = np.empty((*phi.shape, 2, 2), dtype=complex)
+    jones[..., 0, 0], jones[..., 0, 1] = c * c, c * s
+    jones[..., 1, 0], jones[..., 1, 1] = -c * s, -s * s
+    return jones
 
 
 class Model(Material):

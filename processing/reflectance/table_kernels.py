@@ -59,12 +59,12 @@ def _accumulate_at_once(
     start: int,
     stop: int,
 ) -> None:
-    known = np.flatnonzero(rows >= 0)
-    row = rows[known]
+    index = np.flatnonzero(rows >= 0)
+    row = rows[index]
     for n in range(4 * start, min(4 * stop, len(values))):
-        one = values[n, known].astype(float)
-        total[n] += np.bincount(row, one, count.size)
-        square[n] += np.bincount(row, one * one, count.size)
+        plane = values[n, index].astype(float)
+        total[n] += np.bincount(row, plane, count.size)
+        square[n] += np.bincount(row, plane * plane, count.size)
     if start == 0:
         count += np.bincount(row, minlength=count.size)
 

@@ -220,12 +220,12 @@ class ScatteringTable:
         ------
         TableError : the tables do not belong together, or one of them knows no uncertainty of its instrument.
         """
-        mine, theirs = (
+        this, that = (
             (t.quantities, t.wavelength_nm, t.axes, t.simulated, t.frames, t.has_noise, bool(t.inputs), t.scale_u)
             for t in (self, other)
         )
-        if mine != theirs:
-            raise TableError(f"tables differ and cannot be merged: {mine} and {theirs}")
+        if this != that:
+            raise TableError(f"tables differ and cannot be merged: {this} and {that}")
         quantities, start = len(self.quantities), len(self.quantities) * (1 + self.has_noise)
         parts = [t._sum[start:].reshape(-1, quantities, t.count.size) for t in (self, other)]
         self.inputs, (base, more) = of_all_inputs([self.inputs, other.inputs], parts)

@@ -69,9 +69,9 @@ def grid_figure(
 
 def png(figure: Figure) -> bytes:
     """A figure as a PNG for a page."""
-    out = BytesIO()
-    figure.savefig(out, format="png", dpi=PAGE_DPI)
-    return out.getvalue()
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=PAGE_DPI)
+    return buffer.getvalue()
 
 
 def thin(image: NDArray[Any]) -> NDArray[Any]:

@@ -94,10 +94,10 @@ class FileStep(OfFiles, ABC):
         for candidate in (path, own_path):
             if made_of(candidate) == content:
                 return Found(candidate, True)
-        out = own_path if path.exists() else path
-        require_place(out, overwrite=False)
-        self._write(out, record, False, progress)
-        return Found(out, False)
+        target = own_path if path.exists() else path
+        require_place(target, overwrite=False)
+        self._write(target, record, False, progress)
+        return Found(target, False)
 
 
 def beside(source: Path, kind: str) -> Path:

@@ -234,10 +234,10 @@ class CaptureData:
 
 
 def _moved_back(frames: NDArray[np.float32], frame_px: Array) -> NDArray[np.float32]:
-    out = np.empty_like(frames)
+    moved = np.empty_like(frames)
     for n, channel in np.ndindex(frames.shape[:2]):
-        out[n, channel] = shifted_back(frames[n, channel], *frame_px[n, channel])
-    return out
+        moved[n, channel] = shifted_back(frames[n, channel], *frame_px[n, channel])
+    return moved
 
 
 def for_strips(height: int, work: Callable[[slice], object]) -> None:

@@ -483,9 +483,9 @@ def _balance(noise: DetectorNoise, white: float, dark: float) -> tuple[float, fl
 
 
 def _white_in_words(data: CaptureData, white: float, shot: float, dark: float) -> str:
-    out = f"the variance of a pixel is {white:.2f} times what is declared ({data.noise_source})"
+    text = f"the variance of a pixel is {white:.2f} times what is declared ({data.noise_source})"
     if not data.slope.any():
-        return out
+        return text
     # Variance = light / gain + (read noise / gain)^2, of a state that is not a mean of several frames.
     slope, floor = (float(v.max()) * data.binned**2 for v in (data.slope, data.floor))
     gain = 1 / (slope * shot * data.conditions.full_scale)
@@ -494,4 +494,4 @@ def _white_in_words(data: CaptureData, white: float, shot: float, dark: float) -
     parts = ([] if shot == 1 else [f"a gain of {gain:.2g} e/count"]) + (
         [] if same_electrons else [f"a read noise of {read:.2g} e"]
     )
-    return f"{out}, as of {' and '.join(parts)}"
+    return f"{text}, as of {' and '.join(parts)}"

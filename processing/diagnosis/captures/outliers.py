@@ -181,13 +181,13 @@ class _Moments:
         c = self._channels
         worst = None
         for j, state in enumerate(states):
-            mine = slice(j * c, (j + 1) * c)
-            free = p[mine, mine]
+            block = slice(j * c, (j + 1) * c)
+            free = p[block, block]
             # A residual, over what is free of the state, is its difference from the prediction by the others.
             if np.linalg.cond(free) > UNPREDICTED:
                 continue
             back = np.linalg.inv(free)
-            misfit = float(np.sqrt(max(np.trace(back @ beyond[mine, mine] @ back.T), 0.0) / c))
+            misfit = float(np.sqrt(max(np.trace(back @ beyond[block, block] @ back.T), 0.0) / c))
             if worst is None or misfit > worst.misfit:
                 worst = BadFrame(state, misfit)
         return worst

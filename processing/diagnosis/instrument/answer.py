@@ -101,8 +101,8 @@ def _source_percent(problem: InstrumentProblem, k: int, solved: Solution) -> flo
     levels = [p for c, p in slices.items() if c.effect.is_projected and c.capture == k]
     level = 1 + solved.fit.values[levels[0]] if levels else None
     if level is None:
-        data, mine = problem.captures[k], solved.space.acting(k, problem.wavelengths_nm[k])
-        expected = problem.predicted(k, problem.changes(k, mine.space, mine.of(solved.fit.values)))
+        data, acting = problem.captures[k], solved.space.acting(k, problem.wavelengths_nm[k])
+        expected = problem.predicted(k, problem.changes(k, acting.space, acting.of(solved.fit.values)))
         measured = data.signal[:, :, data.usable].mean(axis=2, dtype=float)
         level = np.sum(measured * expected, axis=1) / np.sum(expected**2, axis=1)
     return 100 * float(np.std(level) / np.mean(level))
@@ -112,17 +112,17 @@ def not_measured(problem: InstrumentProblem) -> tuple[NotMeasured, ...]:
     """Frames, hits and pixels that were left out, as the frames are stored."""
     entries = []
     for data in problem.captures:
-        out = data.left_out
-        if out:
+        excluded = data.left_out
+        if excluded:
             entries.append(
                 NotMeasured(
                     capture=data.name,
-                    states=tuple(out.frames),
-                    misfits_percent=tuple(100 * m for m in out.frames.values()),
-                    exchanged=out.exchanged,
-                    hits=tuple((n, c, y * out.pitch, x * out.pitch) for n, c, y, x in out.hits.tolist()),
-                    pixels=tuple((y * out.pitch, x * out.pitch) for y, x in out.pixels.tolist()),
-                    pitch=out.pitch,
+                    states=tuple(excluded.frames),
+                    misfits_percent=tuple(100 * m for m in excluded.frames.values()),
+                    exchanged=excluded.exchanged,
+                    hits=tuple((n, c, y * excluded.pitch, x * excluded.pitch) for n, c, y, x in excluded.hits.tolist()),
+                    pixels=tuple((y * excluded.pitch, x * excluded.pitch) for y, x in excluded.pixels.tolist()),
+                    pitch=excluded.pitch,
                 )
             )
     return tuple(entries)

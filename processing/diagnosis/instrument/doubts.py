@@ -33,17 +33,17 @@ def doubts(
     problem: InstrumentProblem, posterior: Posterior, solved: Solution, causes: Sequence[Cause], *, chi2: float
 ) -> dict[Cause, str]:
     """Reasons by cause; a cause without one may be called by its name. `chi2` is that of structure."""
-    out: dict[Cause, str] = {}
+    reasons: dict[Cause, str] = {}
     static = _static_shifts(problem, solved, causes)
     even = Evenness(problem, solved.space, solved.fit.values)
     for cause in causes:
         reason = STANDS if cause in static else _doubt_of(problem, solved, cause, causes=causes, even=even)
         if reason is not None:
-            out[cause] = reason
+            reasons[cause] = reason
     # What is something else took away a part of what is left over.
-    another = [c.log_odds for c, why in out.items() if why in ELSE and c.log_odds > STANDS_OUT]
+    another = [c.log_odds for c, why in reasons.items() if why in ELSE and c.log_odds > STANDS_OUT]
     chi2 += 2 * posterior.samples.best.unit * sum(another)
-    return with_parts(posterior, causes, out, chi2=chi2, noise_known=problem.noise_known)
+    return with_parts(posterior, causes, reasons, chi2=chi2, noise_known=problem.noise_known)
 
 
 def _doubt_of(

@@ -91,7 +91,7 @@ def _of_capture(
     noise = 0.0
     for n in map(int, np.flatnonzero(use)):
         noise += float(free[n] * np.sum(pixels.variance_of(n)[edge] / (sigma[n] * scale) ** 2))
-    out = np.zeros((len(shifts), int(use.sum()) * int(edge.sum())))
+    leftover = np.zeros((len(shifts), int(use.sum()) * int(edge.sum())))
     for s, group in enumerate(acting):
         if not group:
             continue
@@ -101,14 +101,14 @@ def _of_capture(
         moved = replace(data, signal=frames, true_variance=None).moved_back(-own_px).signal
         change = moved.reshape(images.shape)[:, edge] / sigma[:, :, 0] - fitted[:, edge]
         change -= q @ (q.T @ change)
-        out[s] = (change / scale)[use].reshape(-1)
-    return out, ((images - fitted)[:, edge] / scale)[use].reshape(-1), noise
+        leftover[s] = (change / scale)[use].reshape(-1)
+    return leftover, ((images - fitted)[:, edge] / scale)[use].reshape(-1), noise
 
 
 def _values_without(space: Space, values: Array, candidates: Sequence[Candidate]) -> Array:
     """The values with those of some candidates at zero."""
-    out = values.copy()
+    reduced = values.copy()
     for candidate, part in space.pairs:
         if candidate in candidates:
-            out[part] = 0.0
-    return out
+            reduced[part] = 0.0
+    return reduced

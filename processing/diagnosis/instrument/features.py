@@ -74,24 +74,24 @@ def derivatives_known(height: int, width: int) -> bool:
 
 def inside(height: int, width: int) -> NDArray[np.bool_]:
     """Pixels whose derivatives need nothing beyond the edge; all of them where the image is too small for that."""
-    out = np.ones((height, width), dtype=bool)
+    mask = np.ones((height, width), dtype=bool)
     if derivatives_known(height, width):
-        out[:MARGIN], out[-MARGIN:], out[:, :MARGIN], out[:, -MARGIN:] = False, False, False, False
-    return out
+        mask[:MARGIN], mask[-MARGIN:], mask[:, :MARGIN], mask[:, -MARGIN:] = False, False, False, False
+    return mask
 
 
 def derivatives_of_part(u: NDArray[np.floating], rows: slice, columns: slice) -> NDArray[np.float32]:
     """dx, dy, dxx, dxy, dyy (5, L, rows, columns) of a rectangle of images (L, ...); zero if these are too small."""
     height, width = rows.stop - rows.start, columns.stop - columns.start
-    out = np.zeros((DERIVATIVES, u.shape[0], height, width), dtype=np.float32)
+    derivatives = np.zeros((DERIVATIVES, u.shape[0], height, width), dtype=np.float32)
     if not derivatives_known(*u.shape[1:]):
-        return out
+        return derivatives
     top, left = max(rows.start - MARGIN, 0), max(columns.start - MARGIN, 0)
     inner = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
     for n, frame in enumerate(u[:, top : rows.stop + MARGIN, left : columns.stop + MARGIN]):
         for k, (down, right) in enumerate(ORDERS):
-            out[k, n] = separable(frame, FILTERS[right], FILTERS[down])[inner]
-    return out
+            derivatives[k, n] = separable(frame, FILTERS[right], FILTERS[down])[inner]
+    return derivatives
 
 
 # Frames that did not move, or moved together, share one answer.
@@ -103,9 +103,9 @@ def shared_noise(x_px: float, y_px: float, mixed: SharedNoise = NOTHING_SHARED) 
     """
     across = np.stack([np.convolve(kernel, noise_taps(x_px, mixed.right)) for _, kernel in PATTERNS])
     down = np.stack([np.convolve(kernel, noise_taps(y_px, mixed.down)) for kernel, _ in PATTERNS])
-    out = np.asarray((across @ across.T) * (down @ down.T))
-    out.flags.writeable = False
-    return out
+    covariance = np.asarray((across @ across.T) * (down @ down.T))
+    covariance.flags.writeable = False
+    return covariance
 
 
 def feature_noise(slopes: NDArray[Any], share: NDArray[Any], shared: Array) -> Array:
@@ -114,12 +114,12 @@ def feature_noise(slopes: NDArray[Any], share: NDArray[Any], shared: Array) -> A
     Of slopes (F - 5, L, P) of the features by the signal, variances `share` (L, P), and `shared_noise` (L, 6, 6).
     """
     plain = len(slopes)
-    out = np.zeros((share.shape[0], len(FEATURES), len(FEATURES)))
+    noise = np.zeros((share.shape[0], len(FEATURES), len(FEATURES)))
     by_row = slopes.transpose(1, 0, 2)
-    out[:, :plain, :plain] = (by_row * share[:, None]) @ by_row.transpose(0, 2, 1)
-    cross = out[:, :plain, 0].copy()
-    out[:, :plain, :plain] *= shared[:, :1, :1]
+    noise[:, :plain, :plain] = (by_row * share[:, None]) @ by_row.transpose(0, 2, 1)
+    cross = noise[:, :plain, 0].copy()
+    noise[:, :plain, :plain] *= shared[:, :1, :1]
     cross = cross[:, :, None] * shared[:, :1, 1:]
-    out[:, :plain, plain:], out[:, plain:, :plain] = cross, cross.transpose(0, 2, 1)
-    out[:, plain:, plain:] = share.sum(axis=1, dtype=float)[:, None, None] * shared[:, 1:, 1:]
-    return out
+    noise[:, :plain, plain:], noise[:, plain:, :plain] = cross, cross.transpose(0, 2, 1)
+    noise[:, plain:, plain:] = share.sum(axis=1, dtype=float)[:, None, None] * shared[:, 1:, 1:]
+    return noise

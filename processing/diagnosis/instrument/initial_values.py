@@ -135,15 +135,15 @@ def _turn(candidate: Candidate, values: Array, by_deg: float) -> Array:
 
 def _turn_quarter(problem: InstrumentProblem, values: Values, places: tuple[str, ...]) -> Values:
     """The values with the azimuths of some places turned, each to its nearer side, and diattenuations reversed."""
-    out = dict(values)
+    turned = dict(values)
     reversed_too = {f"{place.rpartition('.')[0]}.diattenuation" for place in places}
     for candidate, value in values.items():
         if candidate.place in places:
             by = -QUARTER_TURN if _mean(candidate, value) > 0 else QUARTER_TURN
-            out[candidate] = _turn(candidate, value, by)
+            turned[candidate] = _turn(candidate, value, by)
         elif candidate.place in reversed_too and candidate.curve is None:
-            out[candidate] = -value - 2 * number(problem.model.value_of(candidate.place) or 0.0)
-    return out
+            turned[candidate] = -value - 2 * number(problem.model.value_of(candidate.place) or 0.0)
+    return turned
 
 
 def _distance(values: Values, places: Collection[str]) -> float:

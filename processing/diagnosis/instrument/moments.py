@@ -209,15 +209,15 @@ def _tiles(pixels: Pixels, pick: BoolArray, grid: _Grid, fold: NDArray[np.int64]
     x, y = grid.x.copy(), grid.y.copy()
     place_x, place_y = places(*pick.shape)
     for t, (down, across) in enumerate(grid.boxes):
-        mine = pick[down, across]
-        weight = 1 / pixels.scale[down, across][mine]
-        part = pixels.u[:, down, across][:, mine] * np.sqrt(weight)
+        inside = pick[down, across]
+        weight = 1 / pixels.scale[down, across][inside]
+        part = pixels.u[:, down, across][:, inside] * np.sqrt(weight)
         s[t], number[t] = part @ part.T, weight.size
-        noise[t] = pixels.variance(slice(None), down, across)[:, mine] @ weight * share
+        noise[t] = pixels.variance(slice(None), down, across)[:, inside] @ weight * share
         # Of a tile at the rim some pixels count, and of those the bright ones: its centre is not where they are.
         light = np.sum(part**2, axis=0)
         if light.any():
-            x[t], y[t] = (np.average(place[down, across][mine], weights=light) for place in (place_x, place_y))
+            x[t], y[t] = (np.average(place[down, across][inside], weights=light) for place in (place_x, place_y))
     return Tiles(s, noise, x, y, fold, grid.index, grid.boxes, pick, number)
 
 
@@ -233,17 +233,17 @@ def _blocks(
     rows, size = len(pixels.u), len(FEATURES) * len(pixels.u)
     many = {part: pick for part, pick in picks.items() if pick.sum() > size}
     sums = dict(zip(many, products_of_pixels(pixels, [*many.values()], kind), strict=True))
-    out: list[Block] = []
+    blocks: list[Block] = []
     for part, pick in picks.items():
         if part in sums:
             root, noise = _square_root(sums[part][0]).reshape(len(FEATURES), rows, -1), sums[part][1]
         else:
             root, noise = features_of_pixels(pixels, pick)
         fold, clipped = part
-        out += _blocks_of(
+        blocks += _blocks_of(
             data, root, noise, fold, clipped=clipped, pixels=int(pick.sum()), parts_of_states=parts_of_states
         )
-    return tuple(out)
+    return tuple(blocks)
 
 
 def _blocks_of(

@@ -51,13 +51,13 @@ def mueller_slopes(
     problem, values = problem.near(space, values)
     for k, moments in enumerate(problem.moments):
         acting = space.acting(k, problem.wavelengths_nm[k])
-        mine, local = acting.space, acting.of(values)
+        subspace, local = acting.space, acting.of(values)
         products, light = np.zeros((16, acting.index.size, acting.index.size)), 0.0
-        changes = problem.changes(k, mine, local)
+        changes = problem.changes(k, subspace, local)
         columns = partial(_all_columns, problem, k)
         w, c = columns(changes), problem.coefficients(k, changes)
         u, size, vt = _decompose(w * moments.counts[:, None])
-        dw, dc = problem.slopes(k, mine, local, w, columns=columns), problem.slopes_of_counts(k, mine, local, c)
+        dw, dc = problem.slopes(k, subspace, local, w, columns=columns), problem.slopes_of_counts(k, subspace, local, c)
         scale = 1 / moments.sigma[:, None]
         for block in moments.blocks[:: problem.folds if moments.tiles is None else 1]:
             y = np.einsum("fl,flr->lr", c, block.z) * scale

@@ -190,11 +190,11 @@ def products_of_pixels(pixels: Pixels, picks: Sequence[BoolArray], kind: Precisi
 
     for_ranges(len(strips), add, align=1, smallest=1)
     in_order = [parts[first] for first in sorted(parts)]
-    out = []
+    totals = []
     for each in zip(*in_order, strict=True):
         products, noise = (sum(terms[1:], terms[0]) for terms in zip(*each, strict=True))
-        out.append((_turned_back(products, pixels) if kind is np.float32 else products, noise))
-    return out
+        totals.append((_turned_back(products, pixels) if kind is np.float32 else products, noise))
+    return totals
 
 
 def _products(z: NDArray[Any], pixels: Pixels) -> NDArray[Any]:

@@ -106,7 +106,7 @@ class InstrumentProblem:
 
     def powers(self) -> list[tuple[int, Array]]:
         """Rows that the unknowns leave over, and the power of each component of the signal, for each capture."""
-        out, empty = [], Space(())
+        powers, empty = [], Space(())
         for k, moments in enumerate(self.moments):
             use = moments.counts
             a = self.columns(k, self.changes(k, empty, np.zeros(0)))[use]
@@ -118,8 +118,8 @@ class InstrumentProblem:
             power = np.maximum(np.linalg.eigvalsh(part @ part.T), 0.0)
             # With a single state, structure can vary over the image only.
             patches = moments.tiles.x.size if moments.tiles and self.captures[k].conditions.states == 1 else 1
-            out.append(((a.shape[0] - q.shape[1]) * patches, power + 1e-300))
-        return out
+            powers.append(((a.shape[0] - q.shape[1]) * patches, power + 1e-300))
+        return powers
 
     def near(self, space: Space, values: Array) -> tuple[InstrumentProblem, Array]:
         """The problem expanded nearest to these values, and what is left of the values there."""
@@ -172,10 +172,10 @@ class InstrumentProblem:
 
     def with_models(self, models: Sequence[InstrumentModel]) -> InstrumentProblem:
         """The same captures against other models of the same instrument."""
-        out = copy(self)
-        out.models, out.model = tuple(models), models[0]
-        out.forget_linearizations()
-        return out
+        variant = copy(self)
+        variant.models, variant.model = tuple(models), models[0]
+        variant.forget_linearizations()
+        return variant
 
     def undivided(self) -> InstrumentProblem:
         """The same with nothing held out: one set of unknowns for all states, not one for each part of them."""
@@ -213,8 +213,8 @@ class InstrumentProblem:
 
     def at(self, wavelength_nm: float) -> InstrumentProblem:
         """The captures at one wavelength alone, nothing held out."""
-        mine = [k for k, w in enumerate(self.wavelengths_nm) if w == wavelength_nm]
-        return InstrumentProblem([self.models[k] for k in mine], [self.still[k] for k in mine], folds=1)
+        indices = [k for k, w in enumerate(self.wavelengths_nm) if w == wavelength_nm]
+        return InstrumentProblem([self.models[k] for k in indices], [self.still[k] for k in indices], folds=1)
 
     def changes(self, capture: int, space: Space, values: Array) -> Changes:
         """Changes of one capture with the instrument's own effects and the active candidates."""
@@ -329,40 +329,40 @@ class InstrumentProblem:
         nearest, local = self.near(space, values)
         if nearest is not self:
             return nearest.sums(space, local, derivatives=derivatives)
-        out = Sums.empty(self.folds, space.size if derivatives else 0, len(self.captures))
+        total = Sums.empty(self.folds, space.size if derivatives else 0, len(self.captures))
         for k, data in enumerate(self.captures):
             acting = space.acting(k, data.wavelength_nm)
-            mine, values_k = acting.space, acting.of(values)
-            part = Sums.empty(self.folds, mine.size if derivatives else 0)
-            changes = self.changes(k, mine, values_k)
-            varies = derivatives and any(c.effect.varies_over_image for c in mine.candidates)
+            subspace, values_k = acting.space, acting.of(values)
+            part = Sums.empty(self.folds, subspace.size if derivatives else 0)
+            changes = self.changes(k, subspace, values_k)
+            varies = derivatives and any(c.effect.varies_over_image for c in subspace.candidates)
             if changes.field_retardance_rad or varies:
-                self._tile_sums(k, mine, values_k, changes, out=part, derivatives=derivatives)
+                self._tile_sums(k, subspace, values_k, changes, out=part, derivatives=derivatives)
             else:
-                self._block_sums(k, mine, values_k, changes, out=part, derivatives=derivatives)
-            out.add(k, part, acting)
-        return out
+                self._block_sums(k, subspace, values_k, changes, out=part, derivatives=derivatives)
+            total.add(k, part, acting)
+        return total
 
     def noise_information(self, space: Space, values: Array) -> Array:
         """Part (K, K) of the curvature that is noise of image derivatives and tells nothing about the values."""
         nearest, local = self.near(space, values)
         if nearest is not self:
             return nearest.noise_information(space, local)
-        out = np.zeros((space.size, space.size))
+        information = np.zeros((space.size, space.size))
         for k, moments in enumerate(self.moments):
             acting = space.acting(k, self.wavelengths_nm[k])
-            mine, values_k = acting.space, acting.of(values)
-            changes = self.changes(k, mine, values_k)
+            subspace, values_k = acting.space, acting.of(values)
+            changes = self.changes(k, subspace, values_k)
             a = self.columns(k, changes)
-            dc = self.slopes_of_counts(k, mine, values_k, self.coefficients(k, changes))
+            dc = self.slopes_of_counts(k, subspace, values_k, self.coefficients(k, changes))
             if np.any(dc[:, -DERIVATIVES:]):
                 noise = np.sum([noise_information(block, a, dc, moments) for block in moments.blocks], axis=0)
-                out[np.ix_(acting.index, acting.index)] += acting.spread_products(noise)
-        return out
+                information[np.ix_(acting.index, acting.index)] += acting.spread_products(noise)
+        return information
 
     def time_noise(self, space: Space, values: Array) -> Array:
         """Variance (K,) that errors of the frames' times make of a source's level in each state, where it drifts."""
-        out = np.zeros(space.size)
+        variance = np.zeros(space.size)
         parts = dict(space.pairs)
         for k, (data, nm) in enumerate(zip(self.captures, self.wavelengths_nm, strict=True)):
             conditions = data.conditions
@@ -378,8 +378,8 @@ class InstrumentProblem:
                         c.apply(changes, self.models[k], values[parts[c]])
                 gains.append(np.broadcast_to(changes.gain, (conditions.states, len(conditions.channels)))[:, 0])
             for c in levels:
-                out[parts[c]] = (gains[1] / gains[0] - 1) ** 2
-        return out
+                variance[parts[c]] = (gains[1] / gains[0] - 1) ** 2
+        return variance
 
     def _block_sums(
         self, k: int, space: Space, values: Array, changes: Changes, *, out: Sums, derivatives: bool

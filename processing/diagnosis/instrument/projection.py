@@ -42,37 +42,37 @@ class NoiseOfParts:
 
     def _of_features(self) -> Array:
         diagonal = np.diagonal(self._outside, axis1=1, axis2=2)[..., None]
-        out = np.asarray(diagonal * self._joined)
+        noise_of = np.asarray(diagonal * self._joined)
         if not self._around.size:
-            return out
+            return noise_of
         hat = self._q @ self._q.transpose(0, 2, 1)
-        out[..., self._around] = (hat * self._outside) @ self._joined[..., self._around]
+        noise_of[..., self._around] = (hat * self._outside) @ self._joined[..., self._around]
         if self._moving.size:
             narrow = self._outside[:, None] @ (self._q[:, None] * self._by_feature(self._c[..., self._moving]))
             # (T, M, L, L): from the noise of each row to the residual, by way of each derivative.
             takes = narrow @ self._q.transpose(0, 2, 1)[:, None]
             noise = self._noise[..., self._moving]
             direct = np.diagonal(takes, axis1=2, axis2=3).swapaxes(1, 2)
-            out[..., self._plain] += np.einsum("tlm,tlfm->tlf", direct, noise[:, :, self._plain])
+            noise_of[..., self._plain] += np.einsum("tlm,tlfm->tlf", direct, noise[:, :, self._plain])
             # One product over rows and derivatives.
             wide = (hat[:, None] * takes).swapaxes(1, 2).reshape(*hat.shape[:2], -1)
             of_around = noise[:, :, self._around].transpose(0, 3, 1, 2)
-            out[..., self._around] += wide @ of_around.reshape(len(hat), -1, self._around.size)
-        return out
+            noise_of[..., self._around] += wide @ of_around.reshape(len(hat), -1, self._around.size)
+        return noise_of
 
     def carried(self, back: Array) -> Array:
         """Mean product (T, L, L) of the residual's noise with that of the counts, times back (T, L, K)."""
         plain, moving = self._plain, self._moving
-        out = np.sum(self._c[..., plain] * self._joined[..., plain], axis=2)[..., None] * back
+        product = np.sum(self._c[..., plain] * self._joined[..., plain], axis=2)[..., None] * back
         if moving.size:
             c = self._by_feature(self._c[..., moving])
             back_of = fitted(self._q[:, None], c * back[:, None])
             joined = self._by_feature(self._joined[..., moving])
-            out += np.sum(joined * back_of, axis=1)
+            product += np.sum(joined * back_of, axis=1)
             noise = self._noise[:, :, moving][..., moving]
             total = joined * back[:, None] + np.einsum("tlfg,tflk->tglk", noise, back_of)
-            out += np.sum(c * fitted(self._q[:, None], total), axis=1)
-        return np.asarray(self._outside @ out)
+            product += np.sum(c * fitted(self._q[:, None], total), axis=1)
+        return np.asarray(self._outside @ product)
 
     @staticmethod
     def _by_feature(x: Array) -> Array:
@@ -92,7 +92,7 @@ def add_response(counts: NDArray[Any], coefficients: Array, a: Array) -> NDArray
     """
     if not np.any(coefficients[1:]):
         return counts
-    out = np.empty_like(counts)
+    result = np.empty_like(counts)
     plain, around = coefficients[:-DERIVATIVES], coefficients[-DERIVATIVES:]
     fitted = None
     if np.any(around):
@@ -106,10 +106,10 @@ def add_response(counts: NDArray[Any], coefficients: Array, a: Array) -> NDArray
         corrected = np.einsum("fl,flhw->lhw", plain, part)
         if fitted is not None:
             corrected += np.einsum("fl,flhw->lhw", around, derivatives_of_part(fitted, rows, slice(0, counts.shape[2])))
-        out[:, rows] = corrected
+        result[:, rows] = corrected
 
     for_strips(counts.shape[1], strip)
-    return out
+    return result
 
 
 def add_block(
@@ -253,18 +253,18 @@ def noise_information(block: Block, a: Array, dc: Array, moments: Moments) -> Ar
 
     Of rows a (L, K) in units of their noise and derivatives dc (K, F, L) of the coefficients by the values.
     """
-    rows, out = block.rows, np.zeros((len(dc), len(dc)))
+    rows, information = block.rows, np.zeros((len(dc), len(dc)))
     moving = np.flatnonzero(np.any(dc[:, -DERIVATIVES:, rows], axis=(1, 2)))
     if not moving.size:
-        return out
+        return information
     q = range_of(a[rows])
     hat = q @ q.T
     noise = block.noise[rows, -DERIVATIVES:, -DERIVATIVES:] / moments.sigma[rows, None, None] ** 2
     # P diag(dc) Q Q^T for each value and derivative.
     into = dc[moving, -DERIVATIVES:][:, :, rows, None] * hat
     into -= hat @ into
-    out[np.ix_(moving, moving)] = np.einsum("ielk,keh,jhlk->ij", into, noise, into, optimize=True)
-    return out
+    information[np.ix_(moving, moving)] = np.einsum("ielk,keh,jhlk->ij", into, noise, into, optimize=True)
+    return information
 
 
 def _flat(x: Array) -> Array:

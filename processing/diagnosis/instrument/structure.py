@@ -265,13 +265,13 @@ def correlates_of(r: NDArray[np.float32], signal: NDArray[np.float32], good: NDA
     ys, xs = np.mgrid[-1 : 1 : r.shape[1] * 1j, -1 : 1 : r.shape[2] * 1j]
     maps = {"brightness": mean, "gradient of the image": np.hypot(gx, gy)}
     maps |= dict(zip(FIELD_TERMS, field_terms(xs, ys), strict=True))
-    out = {}
+    correlations = {}
     for name, image in maps.items():
         x, y = loud[good], image[good]
         # The mean of equal numbers may round to another one, so that their standard deviation is not zero.
         if np.ptp(x) > 0 and np.ptp(y) > 0:
-            out[name] = float(np.corrcoef(x, y)[0, 1])
-    return out
+            correlations[name] = float(np.corrcoef(x, y)[0, 1])
+    return correlations
 
 
 def descriptions(names: Sequence[str], residuals: Sequence[Residual]) -> tuple[str, ...]:

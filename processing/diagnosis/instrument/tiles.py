@@ -148,8 +148,8 @@ def _pixels_of_tiles(pixels: Pixels, tiles: Tiles) -> Iterator[tuple[Part, NDArr
             part = pixels.part(down, slice(left, right), np.float64)
             place = np.arange((down.stop - down.start) * (right - left)).reshape(-1, right - left)
             for _, across in boxes:
-                mine = place[:, across.start - left : across.stop - left]
-                yield part, mine[tiles.pick[down, across]]
+                inside = place[:, across.start - left : across.stop - left]
+                yield part, inside[tiles.pick[down, across]]
 
 
 @dataclass(frozen=True)
@@ -266,12 +266,12 @@ def _curvature(at_nodes: Array, shares: Array, outside: Array, power: Array) -> 
     values, nodes, rows, columns = at_nodes.shape
     # The sum comes as (column, row; row, column): the layout of the derivatives follows, as they are the smaller.
     flat, power = outside.reshape(-1, rows * rows).T, np.ascontiguousarray(power.swapaxes(0, 1))
-    out = np.zeros((values, values))
+    curvature = np.zeros((values, values))
     for node in range(nodes):
         summed = ((flat * shares[node]) @ power).reshape(columns * rows, rows * columns)
         slope = at_nodes[:, node]
-        out += slope.swapaxes(1, 2).reshape(values, -1) @ summed @ slope.reshape(values, -1).T
-    return out
+        curvature += slope.swapaxes(1, 2).reshape(values, -1) @ summed @ slope.reshape(values, -1).T
+    return curvature
 
 
 #: [tiles] That are reckoned with together: what is made of them stays small.
@@ -296,15 +296,15 @@ def add_tiles(
     is_used = np.any(c, axis=1) if slopes is None else np.any(c, axis=1) | np.any(slopes.dc, axis=(0, 2))
     used, use = np.flatnonzero(is_used), np.flatnonzero(moments.counts)
     columns, z, noise = features_of_tiles(data, moments, tiles, used.tolist())
-    mine = np.searchsorted(columns, used)
+    index = np.searchsorted(columns, used)
     around = used >= len(FEATURES) - DERIVATIVES
 
     def projected(fold: int, selection: slice) -> Iterator[tuple[NDArray[np.int64], Projected]]:
         rows = use[selection]
-        scatter = noise[:, selection] if len(columns) == used.size else noise[:, selection, mine[:, None], mine]
+        scatter = noise[:, selection] if len(columns) == used.size else noise[:, selection, index[:, None], index]
         in_fold = np.flatnonzero(tiles.fold == fold)
         for some in np.split(in_fold, range(TILES_TOGETHER, in_fold.size, TILES_TOGETHER)):
-            features = z[some[:, None], mine, selection]
+            features = z[some[:, None], index, selection]
             part = Projected(features, scatter[some], a[some][:, rows], c[None, used][:, :, rows], around=around)
             add_parts(part, moments, rows[None], tiles.pixels[some], fold=fold, out=out)
             yield some, part

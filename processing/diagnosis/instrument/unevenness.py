@@ -43,7 +43,7 @@ class Evenness:
         # What was undone in the counts has no value left there.
         moved = local.copy()
         moved[part] += STEP * self._values[part]
-        out, count = 0.0, 0
+        chi2, count = 0.0, 0
         for k, moments in enumerate(problem.moments):
             tiles = moments.tiles
             if tiles is None or not candidate.acts(k, problem.wavelengths_nm[k]):
@@ -55,10 +55,10 @@ class Evenness:
             slope, power = projected.of_each((moved_rows - rows) / STEP, dc[used])
             smooth = np.vstack([np.ones(tiles.x.size), field_terms(tiles.x, tiles.y)])
             pull = smooth @ slope
-            out += float(pull @ np.linalg.pinv((smooth * power) @ smooth.T, hermitian=True) @ pull)
-            out -= float(pull[0] ** 2 / max(power.sum(), 1e-300))
+            chi2 += float(pull @ np.linalg.pinv((smooth * power) @ smooth.T, hermitian=True) @ pull)
+            chi2 -= float(pull[0] ** 2 / max(power.sum(), 1e-300))
             count += len(smooth) - 1
-        return out - count, count
+        return chi2 - count, count
 
     def _at(self, k: int, values: Array) -> tuple[Array, Array]:
         """Rows (L, K) that count, in units of their noise, and coefficients (F, L) of their counts."""

@@ -157,9 +157,9 @@ class WholeBench:
             return False
         captures = self.whole.captures
         acting = [k for k, c in enumerate(captures) if candidate.acts(k, c.wavelength_nm)]
-        mine = [captures[k] for k in acting]
+        acting_captures = [captures[k] for k in acting]
         if candidate.reaches_around:
-            return all(min(c.signal.shape[2:]) > 2 * MARGIN + 2 for c in mine)
+            return all(min(c.signal.shape[2:]) > 2 * MARGIN + 2 for c in acting_captures)
         if candidate.is_pointwise:
             # With one number a pixel to test, a bend of the response and gains of the channels explain each other. So
             # do, with one ratio a state, a bend and what leaks through the channels, unless the noise tells the light.

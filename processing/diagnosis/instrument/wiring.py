@@ -173,7 +173,7 @@ def _with_states(problem: InstrumentProblem, move: Any) -> InstrumentProblem:
         angles: dict[str, Array] = {k: np.asarray(move(v)) for k, v in data.conditions.angles_deg.items()}
         return replace(data, conditions=replace(data.conditions, angles_deg=angles))
 
-    out = copy.copy(problem)
-    out.captures, out.still = tuple(map(moved, problem.captures)), tuple(map(moved, problem.still))
-    out.forget_linearizations()
-    return out
+    rewired = copy.copy(problem)
+    rewired.captures, rewired.still = tuple(map(moved, problem.captures)), tuple(map(moved, problem.still))
+    rewired.forget_linearizations()
+    return rewired

@@ -204,12 +204,12 @@ def _positions(sets: Sets, groups: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _renumber(sets: Sets, groups: NDArray[np.int64]) -> list[Group]:
-    out, first = [], 0
+    renumbered, first = [], 0
     for k in groups:
         size = sets.groups[k].index.size
-        out.append(replace(sets.groups[k], index=np.arange(first, first + size)))
+        renumbered.append(replace(sets.groups[k], index=np.arange(first, first + size)))
         first += size
-    return out
+    return renumbered
 
 
 class _ByStay:

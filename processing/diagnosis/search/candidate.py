@@ -243,13 +243,13 @@ def nominal_values(
     model: InstrumentModel, conditions: Conditions, wavelengths_nm: Sequence[float]
 ) -> tuple[Candidate, ...]:
     """Candidates for the values that the instrument file calls nominal: azimuths once, all else at every wavelength."""
-    out: list[Candidate] = []
+    candidates: list[Candidate] = []
     for name in model.calibrate:
         effect = NominalValue(name, model)
         belongs = model.belongs_to.get(name, NominalValue.BELONGS.get(effect.field, "wavelength"))
         parameters = effect.parameters(model, conditions, name)
-        out += _over_wavelengths(Candidate(effect, name, parameters), belongs, wavelengths_nm)
-    return tuple(out)
+        candidates += _over_wavelengths(Candidate(effect, name, parameters), belongs, wavelengths_nm)
+    return tuple(candidates)
 
 
 def pool(

@@ -64,7 +64,7 @@ def causes(posterior: Posterior, chi2: float) -> tuple[Cause, ...]:
     `chi2` is that which no cause explains: a smaller difference does not separate two causes.
     """
     state, (values, covariance) = posterior.samples.best, posterior.of_likeliest()
-    out = []
+    result = []
     for k in posterior.free_groups:
         # Of every group to be there in the place of this one, its own among them.
         odds = posterior.sets.conditional(posterior.sets.without(state, k)).log_odds
@@ -77,7 +77,7 @@ def causes(posterior: Posterior, chi2: float) -> tuple[Cause, ...]:
         members = list(dict.fromkeys([k, *alternatives, *_of_family(posterior, k)]))
         # The sets that were visited, and the odds beside the likeliest, each err on the sure side.
         total = float(np.logaddexp.reduce(odds[members]))
-        out.append(
+        result.append(
             Cause(
                 candidates=tuple(posterior.space.candidates[m] for m in posterior.members[k]),
                 values=tuple(values[p] for p in parts),
@@ -87,7 +87,7 @@ def causes(posterior: Posterior, chi2: float) -> tuple[Cause, ...]:
                 alternatives=tuple(posterior.space.candidates[posterior.members[j][0]] for j in alternatives),
             )
         )
-    return tuple(sorted(out, key=lambda c: -c.log_odds))
+    return tuple(sorted(result, key=lambda c: -c.log_odds))
 
 
 def shown(values: Array, covariance: Array) -> float:

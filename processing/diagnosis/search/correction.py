@@ -42,15 +42,15 @@ def _least_needed(posterior: Posterior, keep: Collection[Candidate]) -> list[int
     is_used = np.concatenate([np.zeros(0, dtype=bool), *(np.full(c.size, c in keep) for c in space.candidates)])
     mean = posterior.values / space.joined("typical")
     chi2_at_mean = form.at(mean)
-    out: list[int] = []
+    groups: list[int] = []
     for g in order:
         loss = form.at(np.where(is_used, mean, 0.0)) - chi2_at_mean
         if posterior.samples.probability[g] <= TAKES_PART and loss <= SEEN * posterior.samples.best.unit:
             break
-        out.append(int(g))
+        groups.append(int(g))
         for m in posterior.members[g]:
             is_used[space.slices[m]] = True
-    return out
+    return groups
 
 
 def solution(

@@ -43,9 +43,9 @@ def all_at_once(
         moved, values = np.max(np.abs(new - values) / width), new
         if not problem.relinearize(part, values) and moved < SETTLED:
             break
-    out = x.copy()
-    out[positions] = values
-    return out
+    start_values = x.copy()
+    start_values[positions] = values
+    return start_values
 
 
 def alone(problem: Problem, space: Space, chosen: Sequence[int]) -> Array:
@@ -85,13 +85,13 @@ def descend(
     typical = space.joined("typical")[positions]
     width = np.sqrt(np.diag(samples.covariance) + samples.mean**2)[positions] * typical
     weak = samples.best.unit / np.maximum(width, LEAST_WIDTH * typical) ** 2
-    out = np.where(space.fixed, starts[0], 0.0)
+    values = np.where(space.fixed, starts[0], 0.0)
     if positions.size:
         places = [x[positions] for x in starts]
         chi2 = [problem.sums(part, x, derivatives=False).excess.sum() + weak @ x**2 for x in places]
         best = places[int(np.argmin(np.nan_to_num(chi2, nan=np.inf)))]
-        out[positions] = minimize(problem, part, best, steps=steps, expansions=0, weak=weak).values
-    return out
+        values[positions] = minimize(problem, part, best, steps=steps, expansions=0, weak=weak).values
+    return values
 
 
 def minimum_of(problem: Problem, space: Space, sets: Sets, state: State) -> Array:
@@ -103,11 +103,11 @@ def minimum_of(problem: Problem, space: Space, sets: Sets, state: State) -> Arra
     for k in np.flatnonzero(on):
         tau[sets.groups[k].index] = state.tau[k]
     typical = space.joined("typical")
-    out = np.zeros(space.size)
+    values = np.zeros(space.size)
     weak = state.unit / (tau * typical)[positions] ** 2
     start = (linear * typical)[positions]
-    out[positions] = minimize(problem, part, start, steps=STEPS, expansions=0, weak=weak).values
-    return out
+    values[positions] = minimize(problem, part, start, steps=STEPS, expansions=0, weak=weak).values
+    return values
 
 
 def _part_of(space: Space, groups: Sequence[Group]) -> tuple[Space, NDArray[np.int64]]:

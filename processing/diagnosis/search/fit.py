@@ -241,10 +241,10 @@ def _count_values(space: Space, spent: Array, shares: Array, noise_known: bool) 
     """Values of single states take degrees of freedom of their capture away; what several share, of all alike."""
     for candidate, part in space.pairs:
         if candidate.effect.per_state:
-            mine = slice(None) if candidate.capture is None else candidate.capture
-            each = spent[part].sum() / np.size(shares[mine, 1])
-            shares[mine, 1] -= each
-            shares[mine, 2] += 2 * each * noise_known
+            scope = slice(None) if candidate.capture is None else candidate.capture
+            each = spent[part].sum() / np.size(shares[scope, 1])
+            shares[scope, 1] -= each
+            shares[scope, 2] += 2 * each * noise_known
 
 
 def _in_sample(space: Space, full: Fit, weak: Array) -> HeldOut:

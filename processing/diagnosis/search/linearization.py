@@ -20,11 +20,11 @@ def group_candidates(space: Space, fixed: Sequence[Candidate]) -> tuple[tuple[tu
         by_key.setdefault((c.kind, c.place, c.capture if c.state_chosen else None), []).append(k)
     families = [space.candidates[m[0]].family for m in by_key.values()]
     groups = []
-    for mine, family in zip(by_key.values(), families, strict=True):
-        index = np.concatenate([np.r_[space.slices[k]] for k in mine]).astype(np.int64)
-        always = space.candidates[mine[0]] in fixed
-        curve = space.candidates[mine[0]].effect.is_response
-        price = space.candidates[mine[0]].price
+    for group, family in zip(by_key.values(), families, strict=True):
+        index = np.concatenate([np.r_[space.slices[k]] for k in group]).astype(np.int64)
+        always = space.candidates[group[0]] in fixed
+        curve = space.candidates[group[0]].effect.is_response
+        price = space.candidates[group[0]].price
         groups.append(Group(index, float(families.count(family)), NOMINAL_TAU if always else None, curve, price))
     return tuple(tuple(m) for m in by_key.values()), groups
 

@@ -47,7 +47,7 @@ def with_parts(
 
     `chi2` is that of structure.
     """
-    out = dict(doubt)
+    reasons = dict(doubt)
     for rank, cause in enumerate(causes, 1):
         if noise_known:
             weak = 2 * cause.log_odds * posterior.samples.best.unit < TIMES * rank**2 * chi2
@@ -57,12 +57,12 @@ def with_parts(
             weak = cause.log_odds < max(CERTAIN, TIMES * directions / 2)
         # What the simple form of another cause leaves over is no cause of its own.
         weak |= any(cause.log_odds < o.candidates[0].effect.rough * o.log_odds for o in causes)
-        if cause not in out and weak:
-            out[cause] = PART_OF_LEFT
+        if cause not in reasons and weak:
+            reasons[cause] = PART_OF_LEFT
     # A sentence is a part of an unknown mechanism, whose other parts look like effects of the list.
     if any(posterior.label(k).price for k in posterior.free_groups):
-        out |= {cause: PART_OF_UNLISTED for cause in causes if cause not in out and cause.answer != "unlisted"}
-    return out
+        reasons |= {cause: PART_OF_UNLISTED for cause in causes if cause not in reasons and cause.answer != "unlisted"}
+    return reasons
 
 
 def at_bound(cause: Cause) -> bool:

@@ -191,9 +191,9 @@ class Sets:
 
     def without(self, state: State, k: int) -> State:
         """The state without group k, the unit as it is."""
-        out = state.copy()
-        out.tau[k] = 0.0
-        return out
+        reduced = state.copy()
+        reduced.tau[k] = 0.0
+        return reduced
 
     def among(self, form: Quadratic, indices: NDArray[np.int64], groups: Sequence[Group], beside: int) -> Sets:
         """The same prior for the groups `indices` alone, with new positions; `beside` of the others are in the set."""

@@ -79,8 +79,8 @@ class Acting:
 
     def of(self, values: Array) -> Array:
         """Values of `space`, of the common vector."""
-        mine = values[self.index]
-        return mine if self.mix is None else self.mix @ mine
+        subset = values[self.index]
+        return subset if self.mix is None else self.mix @ subset
 
     def spread(self, slopes: Array) -> Array:
         """Derivatives (..., J) by the common values, of those (..., own values)."""
@@ -123,11 +123,11 @@ class Space:
     def _of_capture(self, capture: int, wavelength_nm: float) -> Acting:
         chosen = [k for k, c in enumerate(self.candidates) if c.acts(capture, wavelength_nm)]
         index = [np.zeros(0, dtype=np.int64), *(np.r_[self.slices[k]] for k in chosen)]
-        mine = Space(tuple(self.candidates[k].at(wavelength_nm) for k in chosen))
+        subspace = Space(tuple(self.candidates[k].at(wavelength_nm) for k in chosen))
         mix = None
         if any(self.candidates[k].curve is not None for k in chosen):
             mix = block_diag(*(self.candidates[k].matrix(wavelength_nm) for k in chosen))
-        return Acting(mine, np.concatenate(index).astype(np.int64), mix)
+        return Acting(subspace, np.concatenate(index).astype(np.int64), mix)
 
     @property
     def pairs(self) -> list[tuple[Candidate, slice]]:

@@ -207,14 +207,14 @@ def _at_cell_centres(data: CaptureData, model: InstrumentModel) -> tuple[NDArray
         raise ProcessError("effects of the reflectance are sought in mosaics of 2 x 2 pixels only.")
     where = {name: (r, c) for r, line in enumerate(mosaic) for c, name in enumerate(line)}
     far = 0.25 / data.binned
-    out = np.empty_like(data.signal)
+    centred = np.empty_like(data.signal)
     for k, channel in enumerate(model.channels):
         plane = data.signal[:, k]
         for axis, offset in zip((1, 2), where[channel.name], strict=True):
             # The rolled edge is outside of what is used.
             plane = (1 - far) * plane + far * np.roll(plane, 1 if offset else -1, axis=axis)
-        out[:, k] = plane
-    return out, np.full(len(model.channels), ((1 - far) ** 2 + far**2) ** 2)
+        centred[:, k] = plane
+    return centred, np.full(len(model.channels), ((1 - far) ** 2 + far**2) ** 2)
 
 
 def _grid(camera: PinholeCamera, side: int, height: int, width: int) -> PinholeCamera:

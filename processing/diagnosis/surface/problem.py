@@ -66,9 +66,9 @@ class SurfacePixels:
 
     def outside(self, v: Array) -> Array:
         """What the two coefficients cannot take up of v (P, L)."""
-        out = v - self.e * np.sum(self.e * v, axis=1, keepdims=True)
-        along = np.sum(self.f * out, axis=1) * (1 - np.sqrt(self.hold))
-        return np.asarray(out - self.f * along[:, None])
+        projected = v - self.e * np.sum(self.e * v, axis=1, keepdims=True)
+        along = np.sum(self.f * projected, axis=1) * (1 - np.sqrt(self.hold))
+        return np.asarray(projected - self.f * along[:, None])
 
 
 class SurfaceProblem:
@@ -97,32 +97,32 @@ class SurfaceProblem:
 
     def _polarized(self) -> tuple[SurfaceData, ...]:
         """The captures with the pixels that can speak; those without enough of them are left out."""
-        out = []
+        subsets = []
         for k, data in enumerate(self.captures):
             w = self.rows(k, Space(()), np.zeros(0))
             subset = data.select(data.polarized(w[:, 0]))
             if len(subset.y) >= FEWEST_OF_MANY:
-                out.append(subset)
-        if not out:
+                subsets.append(subset)
+        if not subsets:
             raise ProcessError(
                 "no polarization stands out of the noise of these captures, so they say nothing about the dominant "
                 "process. Take them with more light, more frames, or another polarization of the source."
             )
-        return tuple(out)
+        return tuple(subsets)
 
     def pool(self) -> tuple[Candidate, ...]:
         """The effects of the reflectance, and those of the optics: with m0 known, an unknown xi0 hides few of them."""
         conditions = self.captures[0].conditions
-        out = []
+        candidates = []
         for effect in reflectance_effects().values():
-            out += [Candidate(effect, p, self._physical(effect, p)) for p in effect.places_on(self.shape)]
+            candidates += [Candidate(effect, p, self._physical(effect, p)) for p in effect.places_on(self.shape)]
         for optics in instrument_effects().values():
             if optics.of_optics:
                 # Sentences without a name imitate smooth patterns over an object.
                 every = optics.places(self.model, conditions)
                 places = [p for p in every if not optics.log_price(self.model, conditions, p)]
-                out += [Candidate(optics, p, optics.parameters(self.model, conditions, p)) for p in places]
-        return tuple(sorted(out, key=lambda candidate: candidate.kind))
+                candidates += [Candidate(optics, p, optics.parameters(self.model, conditions, p)) for p in places]
+        return tuple(sorted(candidates, key=lambda candidate: candidate.kind))
 
     def _physical(self, effect: ReflectanceEffect, place: str) -> tuple[Parameter, ...]:
         """The parameters, with bounds that keep k and a of the material from becoming negative."""
@@ -131,11 +131,11 @@ class SurfaceProblem:
 
     def powers(self) -> list[tuple[int, Array]]:
         """Rows that the unknowns leave over, and equal power of the smooth patterns that a misfit can have."""
-        out = []
+        powers = []
         for k in range(len(self.captures)):
             w = self.rows(k, Space(()), np.zeros(0))
-            out.append((max(rank_of(w) - 2, 1), np.ones(PATTERNS)))
-        return out
+            powers.append((max(rank_of(w) - 2, 1), np.ones(PATTERNS)))
+        return powers
 
     def changes(self, capture: int, space: Space, values: Array) -> tuple[Changes, ReflectanceChanges]:
         """Changes of the instrument, with its own effects, and of the reflectance."""
@@ -222,7 +222,7 @@ class SurfaceProblem:
     def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
         """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
         size = space.size if derivatives else 0
-        out = Sums.empty(self.folds, size, len(self.captures))
+        sums = Sums.empty(self.folds, size, len(self.captures))
         for k, data in enumerate(self.captures):
             part, px = Sums.empty(self.folds, size), self.pixels(k, space, values)
             expected = np.sum(px.free * self.noise[k], axis=1)
@@ -236,12 +236,12 @@ class SurfaceProblem:
                 np.add.at(total, data.fold, each)
             d, less = self.derivatives(k, space, values, px) if size else (np.zeros((0, *px.residual.shape)),) * 2
             for fold in range(self.folds if size else 0):
-                mine = d[:, data.fold == fold].reshape(size, -1)
-                part.gradient[fold] = mine @ px.residual[data.fold == fold].reshape(-1)
+                slopes = d[:, data.fold == fold].reshape(size, -1)
+                part.gradient[fold] = slopes @ px.residual[data.fold == fold].reshape(-1)
                 part.gradient[fold] -= less[:, data.fold == fold].sum(axis=1) / 2
-                part.curvature[fold] = mine @ mine.T
-            out.add(k, part, space.acting(k, data.wavelength_nm))
-        return out
+                part.curvature[fold] = slopes @ slopes.T
+            sums.add(k, part, space.acting(k, data.wavelength_nm))
+        return sums
 
     def derivatives(self, k: int, space: Space, values: Array, px: SurfacePixels) -> tuple[Array, Array]:
         """Derivatives (K, P, L) of the residual by every value, and (K, P) of the noise that is expected in it."""
@@ -268,15 +268,15 @@ class SurfaceProblem:
 
     def noise_information(self, space: Space, values: Array) -> Array:
         """Part (K, K) of the curvature that comes from the noise of alpha_0 and tells nothing about the values."""
-        out = np.zeros((space.size, space.size))
+        information = np.zeros((space.size, space.size))
         for k in range(len(self.captures)):
             pixels = self.pixels(k, space, values)
             free = (1 - pixels.hold) / np.where(pixels.strength > 0, pixels.strength, np.inf)
             moved = self._moved(k, space, values)
             d = [pixels.outside(columns - pixels.columns) * free[:, None] / step for step, columns, _, _ in moved]
             flat = np.reshape(d, (space.size, pixels.residual.size))
-            out += flat @ flat.T
-        return out
+            information += flat @ flat.T
+        return information
 
 
 def _held(full: Array, tile: NDArray[np.int64]) -> tuple[Array, Array]:

@@ -119,7 +119,7 @@ def _image(where: NDArray[np.int64], shape: tuple[int, int], values: Array) -> A
     low, high = where.min(axis=0), where.max(axis=0)
     step = max(int(np.min(np.diff(np.unique(where[:, 0])))), 1)
     size = (high - low) // step + 1
-    out = np.full(tuple(size), np.nan)
+    image = np.full(tuple(size), np.nan)
     index = (where - low) // step
-    out[index[:, 0], index[:, 1]] = values
-    return out
+    image[index[:, 0], index[:, 1]] = values
+    return image

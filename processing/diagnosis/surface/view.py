@@ -82,10 +82,10 @@ class SurfaceView:
 
     def select(self, pixels: NDArray[np.bool_]) -> SurfaceView:
         """The same with some of the pixels alone."""
-        out = copy(self)
-        out.rays, out.points, out.normal = self.rays[pixels], self.points[pixels], self.normal[pixels]
-        out._forget()
-        return out
+        subset = copy(self)
+        subset.rays, subset.points, subset.normal = self.rays[pixels], self.points[pixels], self.normal[pixels]
+        subset._forget()
+        return subset
 
     def geometry(self, changes: ReflectanceChanges) -> ScatteringGeometry:
         """Directions at the pixels, for the sphere and the source where the changes put them."""
@@ -150,10 +150,10 @@ class SurfaceView:
         below = _once(self._below, astuple(material), lambda: self._from_below(material))
         slope = 1 + _disc(0.0, 1.0)[:, ::2] @ np.array(changes.support_slope)
         column = np.einsum("l,t,ltpi->pi", [1.0, changes.support_law], slope, below)
-        out = np.zeros((len(self.points), 4, 4))
+        light = np.zeros((len(self.points), 4, 4))
         # The support's light is not polarized.
-        out[..., 0] = changes.support * (column if self._between is None else self._between(column))
-        return mueller.rotation(-changes.analyzer_rad) @ out if changes.analyzer_rad else out
+        light[..., 0] = changes.support * (column if self._between is None else self._between(column))
+        return mueller.rotation(-changes.analyzer_rad) @ light if changes.analyzer_rad else light
 
     def _from_below(self, changes: ReflectanceChanges) -> Array:
         """Stokes vectors (2, parts, S, 4) of each part's light at the nodes, and times theta_h over 90 degrees."""

@@ -131,13 +131,13 @@ def combinations(posterior: Posterior, solved: Solution) -> tuple[Combination, .
     return tuple(result)
 
 
-def error(problem: Asked, solved: Solution, out: HeldOut, k: int | None = None) -> Error:
+def error(problem: Asked, solved: Solution, held_out: HeldOut, k: int | None = None) -> Error:
     """A residual as it is told, of one capture `k` or of all, in the unit of the counts as they were taken."""
-    noise, rms, beyond = floor(problem, solved, k), 100 * out.rms, None
+    noise, rms, beyond = floor(problem, solved, k), 100 * held_out.rms, None
     if noise is not None:
-        rms /= 1.0 if out is solved.before else stretch(problem, solved, k)
-        beyond = BeyondNoise.of(out.excess, out.freedom, noise)
-    return Error(rms_percent=rms, chi2_reduced=out.chi2_reduced, held_out=problem.held_out, beyond_noise=beyond)
+        rms /= 1.0 if held_out is solved.before else stretch(problem, solved, k)
+        beyond = BeyondNoise.of(held_out.excess, held_out.freedom, noise)
+    return Error(rms_percent=rms, chi2_reduced=held_out.chi2_reduced, held_out=problem.held_out, beyond_noise=beyond)
 
 
 def floor(problem: Asked, solved: Solution, k: int | None = None) -> float | None:
@@ -251,7 +251,7 @@ def ranking(posterior: Posterior, before: HeldOut) -> tuple[Ranked, ...]:
 def unobservable(problem: Asked, posterior: Posterior) -> list[Candidate]:
     """Candidates about which the captures say nothing, the nominal values being free."""
     precision, always = information(posterior)
-    out = []
+    unseen = []
     for candidate, part in posterior.space.pairs:
         if candidate.state_chosen or candidate.effect.is_switch or np.isin(part.start, always):
             continue
@@ -262,23 +262,23 @@ def unobservable(problem: Asked, posterior: Posterior) -> list[Candidate]:
             noise = np.diag(problem.noise_information(alone, np.zeros(alone.size))) * candidate.typical**2
             least = np.maximum(least, SMALL * noise)
         if np.all(precision[part] < least):
-            out.append(candidate)
-    return out
+            unseen.append(candidate)
+    return unseen
 
 
 def checks(problem: Asked, solved: Solution) -> tuple[Check, ...]:
     """Held-out residual, rank and condition of W, before and after: if one gets worse, it is no explanation."""
-    out = [held_out_check(solved, stretch(problem, solved))]
+    figures = [held_out_check(solved, stretch(problem, solved))]
     several = len(problem.captures) > 1
     for k, data in enumerate(problem.captures):
         if several:
             # The sum decides; what became of each is told also where nothing is written.
             old, new = (100 * held_out.of(k).rms for held_out in (solved.before, solved.after))
             name = f"rms on held-out data of {data.name} at {data.wavelength_nm:g} nm, percent"
-            out.append(Check(name=name, before=old, after=new, holds=True))
+            figures.append(Check(name=name, before=old, after=new, holds=True))
         before, after = (problem.rows(k, space, fit.values) for space, fit in solved.ends)
-        out += rows_checks(data.name, before, after)
-    return tuple(out)
+        figures += rows_checks(data.name, before, after)
+    return tuple(figures)
 
 
 @dataclass(frozen=True)

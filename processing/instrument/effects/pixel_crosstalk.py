@@ -20,13 +20,13 @@ def neighbours(mosaic: tuple[tuple[str, ...], ...], channels: Sequence[str]) -> 
     """(channels, channels): fraction of each channel's four neighbours that belongs to each channel."""
     rows, columns = len(mosaic), len(mosaic[0])
     names = list(channels)
-    out = np.zeros((len(names), len(names)))
+    shares = np.zeros((len(names), len(names)))
     for r in range(rows):
         for c in range(columns):
             for dr, dc in ((1, 0), (-1, 0), (0, 1), (0, -1)):
                 neighbour = mosaic[(r + dr) % rows][(c + dc) % columns]
-                out[names.index(mosaic[r][c]), names.index(neighbour)] += 0.25
-    return out
+                shares[names.index(mosaic[r][c]), names.index(neighbour)] += 0.25
+    return shares
 
 
 class PixelCrosstalk(OpticsEffect):

@@ -37,17 +37,17 @@ def split_colours(path: Path, folder: Path) -> tuple[list[Path], bool]:
             raise ProcessError(f"{path} has no colour filter; reduce it as it is.")
         cell = len(colours) // 2
         parts = _parts(colours, cell, capture.frame_shape)
-        out = {name: folder / f"{path.stem}.{name}.h5" for name in parts}
+        files = {name: folder / f"{path.stem}.{name}.h5" for name in parts}
         content = content_of(file_identity(path))
-        if all(_is_part(file, content) for file in out.values()):
-            return list(out.values()), True
-        existing = [str(file) for file in out.values() if file.exists()]
+        if all(_is_part(file, content) for file in files.values()):
+            return list(files.values()), True
+        existing = [str(file) for file in files.values() if file.exists()]
         if existing:
             raise ProcessError(f"{', '.join(existing)} exists. Give another --out.")
         folder.mkdir(parents=True, exist_ok=True)
         for name, (rows, columns) in parts.items():
-            _write(capture, name, out[name], rows, columns=columns, content=content)
-    return list(out.values()), False
+            _write(capture, name, files[name], rows, columns=columns, content=content)
+    return list(files.values()), False
 
 
 def _is_part(path: Path, content: str | None) -> bool:

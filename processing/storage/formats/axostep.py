@@ -201,11 +201,11 @@ def _metadata(data: bytes) -> tuple[dict[str, float], datetime | None, bytes]:
 
 
 def _metadata_bytes(image: MuellerFile) -> bytes:
-    out = b""
+    data = b""
     for name in METADATA:
         if name == "date":
             seconds = (image.date - EPOCH).total_seconds() if image.date else 0.0
-            out += struct.pack(">d", seconds)
+            data += struct.pack(">d", seconds)
         else:
-            out += struct.pack(">f", image.metadata.get(name, 0.0))
-    return out + image.trailer
+            data += struct.pack(">f", image.metadata.get(name, 0.0))
+    return data + image.trailer

@@ -409,16 +409,16 @@ def _numbers(
 ) -> NDArray[np.float64]:
     # A point among decimal commas could only part thousands: as a comma it is no number.
     points = str.maketrans(",.", ".,") if decimal_commas else {}
-    out = np.empty(len(texts))
+    numbers = np.empty(len(texts))
     for k, text in enumerate(texts):
         if not text and role[k] in ("dark", "flat"):
-            out[k] = np.nan
+            numbers[k] = np.nan
             continue
         try:
-            out[k] = math.nan if "_" in text else float(text.rstrip(" °").translate(points))
+            numbers[k] = math.nan if "_" in text else float(text.rstrip(" °").translate(points))
         except ValueError:
-            out[k] = np.nan
-        if not math.isfinite(out[k]):
+            numbers[k] = np.nan
+        if not math.isfinite(numbers[k]):
             shown = repr(text) if text else "an empty cell"
             raise ImportFailed(f"{path}:{lines[k]}: column {name}: {shown} is not a finite number")
-    return out
+    return numbers

@@ -88,7 +88,7 @@ def _unpack(
     source: h5py.Dataset, start: int, stop: int, first: tuple[int, ...], *, cache: KeptChunks | None
 ) -> NDArray[Any]:
     more, columns, height = source.shape[len(first) : -2], source.shape[-1], source.chunks[-2]
-    out = np.empty((*more, stop - start, columns), dtype=source.dtype)
+    rows = np.empty((*more, stop - start, columns), dtype=source.dtype)
 
     def fill(place: tuple[int, ...], top: int) -> None:
         part = slice(max(start, top), min(stop, top + height))
@@ -101,18 +101,18 @@ def _unpack(
             block = _values(isal_zlib.decompress(raw), source.dtype).reshape(height, columns)
             if cache is not None and part.stop - part.start < height:
                 cache.keep(index, block)
-        out[place][part.start - start : part.stop - start] = block[part.start - top : part.stop - top]
+        rows[place][part.start - start : part.stop - start] = block[part.start - top : part.stop - top]
 
     chunks = list(_chunks(more, start // height * height, stop, height))
     threads = min(thread_count(), len(chunks))
     if threads == 1:
         for place, top in chunks:
             fill(place, top)
-        return out
+        return rows
     with ThreadPoolExecutor(threads) as pool:
         for done in [pool.submit(fill, *chunk) for chunk in chunks]:
             done.result()
-    return out
+    return rows
 
 
 def _chunks(more: tuple[int, ...], top: int, stop: int, height: int) -> Iterator[tuple[tuple[int, ...], int]]:
