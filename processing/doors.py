@@ -112,7 +112,7 @@ def require_room(path: Path, values: int, error: type[ProcessError] = ProcessErr
 
 
 def require_distinct(paths: Iterable[Path]) -> None:
-    """Raise ProcessError where a file is given twice: what it says would count twice, and errors come out too small."""
+    """Raise ProcessError if a file is given twice: its data would count twice, and errors would be too small."""
     first_path: dict[tuple[int, int], Path] = {}
     for path in paths:
         # What is not there is told by its reader.

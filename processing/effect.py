@@ -1,4 +1,4 @@
-"""What effects of an instrument and of a reflectance share: a kind, parameters, and how their files are found."""
+"""Base of the effects of an instrument and of a reflectance: a kind, parameters, and how their files are found."""
 
 import importlib
 import inspect

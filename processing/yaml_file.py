@@ -265,7 +265,7 @@ def _describe(source: str, tree: CommentedMap, model: type[BaseModel], entries: 
 
 
 def _of_the_type_meant(entries: Sequence[tuple[tuple[str, ...], Any]]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Leave out that keys or a list are no number, say, where they could be so, and have a mistake of their own."""
+    """Drop type errors of a mapping or list if an entry below it has an error of its own."""
     mistakes = [keys for keys, entry in entries if not _wrong_type(entry)]
     for keys, entry in entries:
         if not _wrong_type(entry) or not any(mistake[: len(keys)] == keys for mistake in mistakes):

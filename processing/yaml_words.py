@@ -89,7 +89,7 @@ def mistakes_of(error: ValidationError) -> list[Any]:
 
 
 def words_of(entry: Any, names: Sequence[str] = ()) -> str:
-    """What one entry of a ValidationError says.
+    """Text of one entry of a ValidationError.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def words_of(entry: Any, names: Sequence[str] = ()) -> str:
 
 
 def _value_text(kind: str, entry: Any) -> str:
-    """The value itself, where it is short and not told already."""
+    """The value itself, if it is short and the text does not contain it yet."""
     value = entry.get("input")
     if kind in NEEDS_NO_VALUE or isinstance(value, dict | list | tuple):
         return ""

@@ -1,1 +1,1 @@
-"""What is found out about an instrument or chosen for it before it measures."""
+"""Calibration of an instrument, and the design of its states, before it measures."""

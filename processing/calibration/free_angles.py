@@ -29,7 +29,7 @@ AT_BOUND = 1.002
 
 @dataclass(frozen=True)
 class Goal:
-    """What makes a table good.
+    """Criterion by which a table of states is optimized.
 
     Attributes
     ----------

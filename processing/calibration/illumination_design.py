@@ -31,7 +31,7 @@ def linear_states(step_deg: float = 15.0) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class Assumptions:
-    """What the prediction takes for granted: a surface with one xi0 and a M00 of cos(incidence) times `albedo`.
+    """Assumptions of the prediction: a surface with one xi0 and a M00 of cos(incidence) times `albedo`.
 
     `electrons` is the signal of a channel for M00 = 1 under unpolarized light; `read_noise_e` its read noise.
     """

@@ -1,4 +1,4 @@
-"""What a capture of a known sample says of the trains: mean signals of a region beside what a model predicts.
+"""Mean signals of a region in a capture of a known sample, and the signals that a model predicts.
 
 The sample is known up to one throughput for each pixel, so the throughput is eliminated: for every trial of the
 parameters it has its least-squares value (variable projection).

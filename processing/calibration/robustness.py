@@ -1,4 +1,4 @@
-"""What undeclared errors of a bench do to the Mueller matrix that a table of states gives."""
+"""Effect of undeclared errors of a bench on the Mueller matrix that a table of states gives."""
 
 from collections.abc import Mapping
 

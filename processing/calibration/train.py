@@ -59,7 +59,7 @@ class FittedValues:
 
 @dataclass(frozen=True)
 class Calibration(FittedValues):
-    """What was fitted to one capture.
+    """Values fitted to one capture.
 
     Attributes
     ----------
@@ -207,7 +207,7 @@ class _Fit:
         return [with_values(part.model, self.shared.names, values) for part, values in tried]
 
     def rms(self, searched: NDArray[np.float64]) -> float:
-        """Of the residuals of all parts, over the mean signal of each."""
+        """Rms of the residuals of all parts, each over its mean signal."""
         each = zip(self.parts, self.models(searched), strict=True)
         return float(np.sqrt(np.mean(np.concatenate([part.residual(model) for part, model in each]) ** 2)))
 
@@ -261,7 +261,7 @@ class _Fit:
         return units
 
     def covariance(self, minimum: Any) -> NDArray[np.float64]:
-        """(U, U) of what is searched.
+        """Covariance (U, U) of the unknowns.
 
         Raises
         ------

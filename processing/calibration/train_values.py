@@ -42,7 +42,7 @@ def checked_names(model: InstrumentModel, free: Sequence[str]) -> tuple[str, ...
 
 
 def belongs_to(model: InstrumentModel, name: str) -> str:
-    """What a value belongs to: "mechanics", "dispersion" or another of the instrument file's words."""
+    """The class of a value: "mechanics", "dispersion" or another of the instrument file's words."""
     rule = "mechanics" if name.rpartition(".")[2] in MECHANICAL else "dispersion"
     return model.belongs_to.get(name, rule)
 
@@ -92,7 +92,7 @@ class TrainValues:
         wavelengths_nm: Sequence[float],
         curve: WavenumberCurve | None,
     ) -> "TrainValues":
-        """Mounts once, the rest along the curve; without a curve, or where the file says so, at each wavelength."""
+        """Mounts once, other values along the curve; at each wavelength without a curve, or if the file asks."""
         unknown: list[Unknown] = []
         for name in names:
             belongs = belongs_to(model, name)

@@ -36,7 +36,7 @@ class Changed:
 
 @dataclass(frozen=True)
 class Change:
-    """What changed since the reference.
+    """Changes since the reference.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ def _changes(products: list[Path], region: Region) -> list[Changed]:
 
 
 def comparable(path: Path) -> dict[str, str]:
-    """What two captures that are compared have in common."""
+    """Properties that two compared captures share."""
     with Capture(path) as opened:
         header, origin = opened.header, "simulated" if opened.simulated else "measured"
     sample = header.sample.name or header.sample.kind

@@ -1,4 +1,4 @@
-"""Where independent tasks run: here, in worker processes, or on a dask.distributed cluster. One interface."""
+"""Executors of independent tasks: this process, worker processes, or a dask.distributed cluster. One interface."""
 
 import importlib
 import os

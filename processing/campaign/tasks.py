@@ -1,4 +1,4 @@
-"""What a campaign does with one capture, as a function that can run in another process or on another machine."""
+"""The work of a campaign on one capture, as a function that can run in another process or on another machine."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,7 +58,7 @@ class CaptureTask:
 
 @dataclass(frozen=True)
 class CaptureMeasure:
-    """What one capture gives. psi, |D| and the eigenvalues only from a Mueller capture."""
+    """Results of one capture. psi, |D| and the eigenvalues only from a Mueller capture."""
 
     kind: str
     wavelength_nm: float

@@ -165,7 +165,7 @@ def place_for(inputs: Sequence[Path], out: Path | None) -> Callable[[Path], Path
 
 
 def written_if_changed(target: Path, overwrite: bool, write: Callable[[Path], Sequence[Path]]) -> Made:
-    """Files of other programs, which do not say what they were made of: written anew, and compared byte for byte.
+    """Files for other programs, which do not record their inputs: written again, and compared byte for byte.
 
     Parameters
     ----------

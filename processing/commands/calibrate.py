@@ -117,7 +117,7 @@ def _tell(title: str, fitted: FittedValues) -> None:
 
 
 def _tell_curves(curves: CurveFit) -> None:
-    """How well the curves fit beside a value at each wavelength."""
+    """The fit of the curves, compared with one value at each wavelength."""
     from processing.calibration.train import UNLIKELY
 
     typer.echo(

@@ -1,4 +1,4 @@
-"""What the five commands share: their look, `--version`, and errors of the user as one message, never a traceback."""
+"""Common parts of the five commands: their look, `--version`, and user errors as one message without a traceback."""
 
 import atexit
 import gc

@@ -124,7 +124,7 @@ def _counts(text: str) -> list[int]:
 def _present(
     model: InstrumentModel, count: int, ratio: float, step: float | None, *, table: Path | None
 ) -> StateTable | None:
-    """What is measured now: the table that is given, or equal steps where there can be such."""
+    """The states of the present measurement: the given table, or equal steps where the instrument allows them."""
     from processing.errors import ProcessError
 
     try:

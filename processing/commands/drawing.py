@@ -1,4 +1,4 @@
-"""The figure that a command leaves beside its product."""
+"""The figure that a command writes next to its product."""
 
 from pathlib import Path
 from typing import Annotated

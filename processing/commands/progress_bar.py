@@ -1,4 +1,4 @@
-"""What commands show while they work: one progress bar for anything that can take over a second."""
+"""Progress of the commands: one progress bar for anything that can take over a second."""
 
 from __future__ import annotations
 

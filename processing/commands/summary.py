@@ -1,4 +1,4 @@
-"""What a command prints about its product."""
+"""The text that a command prints about its product."""
 
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,7 @@ def print_warnings(product: Path, head: str = "") -> None:
 
 
 def one_line(product: Path) -> str:
-    """What a batch prints after the name of a product: whether it is simulated, and its first median."""
+    """The text after the name of a product in a batch: whether it is simulated, and its first median."""
     from processing.storage.products.product import Product
 
     with Product(product) as opened:

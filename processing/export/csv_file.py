@@ -26,5 +26,5 @@ def write_csv(
 
 
 def _digits(dtype: np.dtype[Any]) -> str:
-    """As many digits as a value has, so that reading it back gives the same."""
+    """All digits of a value, so that reading it back gives the same number."""
     return {"f": "%.9g" if dtype.itemsize <= 4 else "%.17g", "i": "%d", "u": "%d"}.get(dtype.kind, "%s")

@@ -52,7 +52,7 @@ def write_figure(source: Path, path: Path, planes: Sequence[str]) -> None:
 
 
 def _valid_pixels(product: Product) -> NDArray[np.bool_]:
-    """Where a product's own mask says that its values mean something; everywhere without one."""
+    """Pixels whose values the product's own mask calls valid; all pixels without a mask."""
     mask = np.ones(product.shape, dtype=bool)
     for name in MASKS:
         if name in product.names:

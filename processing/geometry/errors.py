@@ -1,4 +1,4 @@
-"""What can go wrong between an image and its geometry."""
+"""Errors of the relation between an image and its geometry."""
 
 from processing.errors import NotDetermined, ProcessError
 

@@ -67,7 +67,7 @@ def _values(applied: AppliedEffect, effect: InstrumentEffect, parameters: tuple[
 
 
 def changes_of(model: InstrumentModel, conditions: Conditions, capture: str | None = None) -> Changes:
-    """What the instrument's effects change; those of scope "capture" only if `capture` is among their captures."""
+    """Changes by the instrument's effects; those of scope "capture" only if `capture` is among their captures."""
     changes = Changes(conditions)
     for applied in model.effects:
         if applied.scope == "instrument" or (capture is not None and capture in applied.captures):
@@ -76,6 +76,6 @@ def changes_of(model: InstrumentModel, conditions: Conditions, capture: str | No
 
 
 def changes_at(model: InstrumentModel, angles_deg: Mapping[str, ArrayLike]) -> Changes:
-    """What the instrument's own effects change at bare angles, axis name to (N,), that belong to no capture."""
+    """Changes by the instrument's own effects at angles (axis name to (N,)) that belong to no capture."""
     arrays = {axis: np.asarray(angle, dtype=float).reshape(-1) for axis, angle in angles_deg.items()}
     return changes_of(model, Conditions.of(arrays, tuple(c.name for c in model.channels)))

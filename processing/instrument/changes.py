@@ -1,4 +1,4 @@
-"""What effects change in the forward model of one capture: elements, gains and counts, state by state."""
+"""Changes by effects in the forward model of one capture: elements, gains and counts, state by state."""
 
 from collections import defaultdict
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ FIELD_TERMS = ("x", "y", "x2", "xy", "y2")
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the states of one capture have in common with any other, and what sets them apart.
+    """Conditions of the states of one capture.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ def elapsed_error(time_s: Array, other_s: Array) -> float:
 
 
 def places(height: int, width: int) -> tuple[Array, Array]:
-    """Where each pixel (rows, columns) of an image is, x to the right and y down, from -1 to 1."""
+    """Position of each pixel (rows, columns) of an image, x to the right and y down, from -1 to 1."""
     y, x = (np.linspace(-1, 1, size) if size > 1 else np.zeros(1) for size in (height, width))
     return np.broadcast_to(x, (height, width)), np.broadcast_to(y[:, None], (height, width))
 
@@ -161,7 +161,7 @@ class Changes:
         return subset
 
     def key(self, element: str, azimuth_rad: Array) -> tuple[str, bytes]:
-        """What the Mueller matrices of an element depend on, its own values left out."""
+        """Key of all changes on which the Mueller matrices of an element depend, without its own values."""
         kinds = (self.retardance_rad, self.extinction, self.diattenuation, self.depolarization)
         parts = (azimuth_rad, *(change[element] for change in kinds))
         return element, b"|".join(np.asarray(p, dtype=float).tobytes() for p in parts)
@@ -186,7 +186,7 @@ class Changes:
         self.drop_clipped = self.drop_clipped or other.drop_clipped
 
     def turn_axis(self, axis: str, error_deg: Array, elements: Mapping[str, float]) -> None:
-        """The axis stands `error_deg` (N,) from where it says; `elements` are the ratios of those that it turns."""
+        """The axis has an error of `error_deg` (N,); `elements` are the ratios of the elements that it turns."""
         for name, ratio in elements.items():
             self.azimuth_rad[name] = self.azimuth_rad[name] + ratio * np.deg2rad(error_deg)
 

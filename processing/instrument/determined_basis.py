@@ -1,4 +1,4 @@
-"""What an instrument can determine of a Mueller matrix: all 16 elements, or fewer for a partial polarimeter."""
+"""The part of a Mueller matrix that an instrument determines: all 16 elements, or fewer for a partial polarimeter."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ LEAST = 1e-8
 
 
 def determined_basis(model: InstrumentModel) -> Array:
-    """Orthonormal basis (16, rank) of what states of this instrument can determine; `model` is at a wavelength.
+    """Orthonormal basis (16, rank) of the matrices that the instrument determines; `model` is at a wavelength.
 
     Its span is that of all rows kron(a, g): 16 for two turning retarders, 4 for a Stokes polarimeter, 9 where only
     linear polarization is sent and analyzed.

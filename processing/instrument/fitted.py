@@ -1,4 +1,4 @@
-"""What `diagnose` writes into an instrument file: effects with their values, and what stays uncertain.
+"""Entries that `diagnose` writes into an instrument file: effects with their values, and the remaining uncertainty.
 
 There are many uncertain directions. A file has their values by effect and no more: written as the effects of a
 correction are, those of three captures took a file as long as none is read.

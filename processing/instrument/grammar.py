@@ -115,7 +115,7 @@ class Sentence:
 
     @property
     def of_one_capture(self) -> bool:
-        """Whether it follows the time of a capture, and would be another one in the next."""
+        """Whether it depends on the time of a capture, and differs in the next capture."""
         return bool(self.course) and not self.course.startswith("by ")
 
     def price(self, conditions: Conditions) -> float:
@@ -261,7 +261,7 @@ def _exponential(a: Array) -> Array:
 
 
 def sentences(model: InstrumentModel, conditions: Conditions) -> tuple[Sentence, ...]:
-    """All that can be said of an instrument in these conditions, beside what has a name."""
+    """All sentences about an instrument in these conditions, without the effects that have names."""
     turning = [axis for axis in model.axes if _turns(conditions, axis)]
     times = TIMES if conditions.states >= FEWEST_STATES else ()
     result: list[Sentence] = []
@@ -301,7 +301,7 @@ def _waves(site: str, quantities: tuple[str, ...], axes: Sequence[str], periods:
 def _of_element(
     element: Element, turning: Sequence[str], passed: list[str], times: Sequence[str], *, front: bool
 ) -> Iterator[Sentence]:
-    """Of one element, which may follow the axes that light has `passed`; its own is then among them."""
+    """Sentences about one element, which may depend on the axes that the light has `passed`, its own included."""
     name, earlier = element.name, tuple(passed)
     axes = [element.axis] if element.axis in turning and element.axis else []
     passed += [axis for axis in axes if axis not in passed]
@@ -324,7 +324,7 @@ def _of_element(
 
 
 def _of_path(passed: Sequence[str], times: Sequence[str]) -> Iterator[Sentence]:
-    """Of what lies between the trains, and of the sample."""
+    """Sentences about the path between the trains, and about the sample."""
     for quantities in OF_THE_PATH:
         yield from _waves("path", quantities, passed, (1, 2))
         yield from (Sentence("path", quantities, time) for time in times)

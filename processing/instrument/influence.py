@@ -1,4 +1,4 @@
-"""What each value that `diagnose` wrote into an instrument file does to a Mueller matrix."""
+"""The effect on a Mueller matrix of each value that `diagnose` wrote into an instrument file."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -50,7 +50,7 @@ def value_directions(model: InstrumentModel) -> Iterator[ValueDirection]:
 
 
 def of_all_inputs(inputs: Sequence[tuple[str, ...]], moves: Sequence[Array]) -> tuple[tuple[str, ...], list[Array]]:
-    """What the inputs of all instruments do to each of several results, zero where the instrument is another.
+    """Effect of the inputs of all instruments on each of several results; zero for the inputs of other instruments.
 
     Parameters
     ----------

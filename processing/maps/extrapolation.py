@@ -131,7 +131,7 @@ class ExtrapolatedImage:
 
     @property
     def moves(self) -> NDArray[np.float64] | None:
-        """What each uncertain input of the instrument does to M with m00 held, (D, 16, rows, columns); None without."""
+        """Change of M, with m00 fixed, by each uncertain input, (D, 16, rows, columns); None without."""
         if self.directions is None:
             return None
         moved = self.directions[:, None] * self._signed

@@ -77,7 +77,7 @@ def has_own_95(name: str) -> bool:
 
 
 class ElementNoise(Protocol):
-    """What an image knows of the errors of its elements."""
+    """Errors of the elements of an image."""
 
     def covariance(self) -> NDArray[np.floating]: ...
 
@@ -150,7 +150,7 @@ def set_ellipticity(planes: Planes) -> None:
 
 
 def set_ratios(planes: Planes, derived: Mapping[str, Derived], image: ElementNoise, m00: Array) -> None:
-    """What the noise of m00 does to ratios beyond first order, after Fieller. All others are done.
+    """Effect of the noise of m00 on ratios beyond first order, after Fieller. Call it after all other functions.
 
     With q = a/b to first order in all elements but b = m00, a - q0 b is normal for every q0, and its variance is that
     of q, less twice the covariance of q and b times what q0 is off, plus the variance of b times that squared, over
@@ -211,7 +211,7 @@ def over_m00(sides: Array, u: Array, shared: Array, deviate: float) -> Array:
 
 
 def whole_range(name: str, value: Array) -> tuple[Array, Array]:
-    """What a quantity can be, (...) each; of an angle all of its period about the value."""
+    """Range of a quantity, (...) each; for an angle one period about the value."""
     if name in ANGLES:
         half = 45.0 if name == EITHER_AXIS else 90.0
         middle = np.where(np.isfinite(value), value, half)
@@ -222,7 +222,7 @@ def whole_range(name: str, value: Array) -> tuple[Array, Array]:
 
 
 def moves_of(systematic: Systematic, image: MuellerImage) -> Array:
-    """What one standard uncertainty of each uncertain input of the instrument does to M: (D, 16, rows, columns)."""
+    """Change of M by one standard uncertainty of each uncertain input of the instrument: (D, 16, rows, columns)."""
     # What a partial polarimeter does not determine is zero in the solution of least norm.
     values = np.where(image.is_determined[:, None], image.values.reshape(16, -1), 0)
     return np.stack(list(systematic.moves(values))).reshape(-1, 16, *image.mask.shape)

@@ -128,7 +128,7 @@ def _of_mueller(source: Path, view: ViewingGeometry) -> _Data:
 
 
 def determined_values(image: MuellerImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What a product determines, (K, pixels), and the rows (K, 16) that lead to it from M.
+    """Quantities that a product determines, (K, pixels), and the rows (K, 16) that map M to them.
 
     Elements of M, or the Stokes vector that is sent back where no element is determined alone.
     """

@@ -178,7 +178,7 @@ class _Mean:
 
     @property
     def alike(self) -> tuple[object, ...]:
-        """What captures of one mean have in common."""
+        """Properties that captures of one mean share."""
         i = self.image
         rank = tuple(i.is_determined) if isinstance(i, MuellerImage) else ()
         return type(i), rank, round(i.header.wavelength_nm), i.simulated, bool(self.inputs)

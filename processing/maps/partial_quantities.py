@@ -76,7 +76,7 @@ def partial_block(
 
 
 def partial_facts(writer: ProductWriter, names: list[str]) -> dict[str, Any]:
-    """What the product says of itself: the maps that there are, and their medians where there is light."""
+    """Facts of the product: its maps, and their medians where there is light."""
     lit = writer.get("lit") > 0
     facts: dict[str, Any] = {
         "pixels": int(lit.size),

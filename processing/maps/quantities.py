@@ -101,7 +101,7 @@ def quantities_of_mueller(
 
 
 class _Maps(NamedTuple):
-    """What a product determines: planes of the new one, their values for some rows, what it says of itself."""
+    """Maps that a product determines: planes of the new product, their values for some rows, and its facts."""
 
     planes: dict[str, Plane]
     block: Callable[[slice], dict[str, NDArray[Any]]]
@@ -109,7 +109,7 @@ class _Maps(NamedTuple):
 
 
 def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
-    """Of whole matrices, of the elements of a partial polarimeter, or of a Stokes vector.
+    """Maps of whole matrices, of the elements of a partial polarimeter, or of a Stokes vector.
 
     Raises
     ------
@@ -250,7 +250,7 @@ def _set_intervals(
     depolarizer: NDArray[np.floating],
     retardance: VectorNoise,
 ) -> None:
-    """What first order does not give: see `processing.maps.intervals`."""
+    """Intervals that first order does not give: see `processing.maps.intervals`."""
     error, linear_error = planes["retardance_deg_errors"], planes["retardance_linear_deg_errors"]
     diattenuation_error = planes["diattenuation_errors"]
     factor: NDArray[np.float64] | float = 1.0

@@ -77,7 +77,7 @@ def light_of(image: MuellerImage, stokes_errors: NDArray[np.float32] | None) -> 
 
 
 def moves_of_light(systematic: Systematic, image: MuellerImage) -> NDArray[np.float64]:
-    """What each uncertain input of the instrument does to the first column of M: (D, 16, rows, columns)."""
+    """Change of the first column of M by each uncertain input of the instrument: (D, 16, rows, columns)."""
     if image.sent is None:
         return moves_of(systematic, image)
     least = np.linalg.pinv(image.w, rcond=SMALLEST) @ image.fitted

@@ -90,7 +90,7 @@ def _add_mueller(
 
 
 def _shares(left: Array, right: Array) -> dict[tuple[int, int], Array]:
-    """What each element (second) adds to each turned one (first), (N,), of turning matrices (4, 4, N)."""
+    """Share (N,) of each element (second) in each turned element (first), for turning matrices (4, 4, N)."""
     return {(k, i): left[k // 4, i // 4] * right[i % 4, k % 4] for g in _MIXED for k in g for i in g}
 
 

@@ -135,7 +135,7 @@ def eigenvalue_block(image: MuellerImage) -> dict[str, NDArray[Any]]:
 
 
 def is_valid(image: MuellerImage, noise: EigenvalueNoise) -> NDArray[np.bool_]:
-    """Whether noise is small enough for xi0 to say something, (rows, columns); does not depend on xi0 itself."""
+    """Whether the noise is small enough to determine xi0, (rows, columns); it does not depend on xi0 itself."""
     return np.asarray((image.values[0, 0] > 0) & (noise.overall <= MAX_STDERR) & (noise.m00 <= MAX_M00_ERROR))
 
 
@@ -159,7 +159,7 @@ def set_xi0_systematic(planes: dict[str, NDArray[Any]], moved: NDArray[np.float6
 
 
 def moved_xi0(systematic: Systematic, image: MuellerImage) -> NDArray[np.float64]:
-    """What each direction does to the largest eigenvalue, (D, rows, columns), to first order."""
+    """Change of the largest eigenvalue by each direction, (D, rows, columns), to first order."""
     xi0, m0 = xi0_and_dominant(image.matrices)
     slope = m0.reshape(*m0.shape[:2], 16).astype(float)
     slope[..., 0] -= 4 * xi0
@@ -175,7 +175,7 @@ def _systematic_facts(systematic: Systematic, errors: NDArray[Any]) -> dict[str,
 def refitted(
     systematic: Systematic, fitted: NDArray[np.floating], xi0: NDArray[np.float64], m0: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """What each direction does to xi0, the two-coefficient estimate of intensities (K, rows, columns): (D, ...)."""
+    """Change (D, ...) by each direction of xi0, the two-coefficient estimate of intensities (K, rows, columns)."""
     flat = fitted.reshape(len(fitted), -1)
     moved = []
     for direction in systematic.directions:

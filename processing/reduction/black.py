@@ -105,7 +105,7 @@ class Black:
         return noise.averaged_floor(repeats, self._excess(noise)) / self.states
 
     def excess(self, noise: NoiseModel | None, exposure_s: ArrayLike) -> Array:
-        """What a frame's variance without light has above `noise`, counts^2, at each exposure (N,).
+        """Variance of a frame without light in excess of `noise`, counts^2, at each exposure (N,).
 
         That is the shot noise of the dark current. It is taken from the scatter of the dark states, which needs no
         black level; 0 where it is within its error.
@@ -121,7 +121,7 @@ class Black:
             return np.where(over > BELIEVED * self.scatter_stderr, over * repeats, 0.0)
 
     def in_words(self, exposure_s: ArrayLike) -> str:
-        """What is subtracted from states of these exposures."""
+        """Description of the black that is subtracted from states of these exposures."""
         if not self.measured:
             level = float(self.means.ravel()[0])
             return f"black level {level:g} counts from the header" if level else "no black was subtracted"
@@ -139,7 +139,7 @@ class Black:
         return f"{matched_text}; at {_seconds(light[~matched])}: {line}"
 
     def warnings(self, exposure_s: ArrayLike) -> list[str]:
-        """What the user should know about exposures (N,) without darks of their own."""
+        """Warnings about exposures (N,) without their own darks."""
         light = np.unique(np.asarray(exposure_s, dtype=float))
         unmatched = light[~self.matches(light)]
         if not self.measured or unmatched.size == 0:

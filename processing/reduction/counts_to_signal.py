@@ -19,7 +19,7 @@ from processing.storage.products.pixel_mask import Mask
 
 @dataclass(frozen=True)
 class CountCorrection:
-    """What is subtracted, divided out and left out.
+    """Black, flat field and mask that turn counts into signal.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class CountCorrection:
         dark_from: Capture | None = None,
         flat_from: Sequence[Capture] = (),
     ) -> "CountCorrection":
-        """What the capture offers: dark states, else the header's black level, else nothing (and says so).
+        """Correction by the capture's dark states, else by the header's black level, else none with a warning.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""States whose counts are cut off at zero: an offset pushed the dark part of the image below what the camera tells."""
+"""States whose counts are cut off at zero: an offset moved the dark part of the image below the smallest count."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""What an instrument file's effects (found by `diagnose`) mean for one capture that is about to be reduced."""
+"""Effects of an instrument file (found by `diagnose`) applied to one capture before its reduction."""
 
 from collections import defaultdict
 from copy import copy
@@ -63,7 +63,7 @@ def full_scale(capture: Capture, states: NDArray[np.int64]) -> float:
 
 
 def capture_changes(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> Changes | None:
-    """What the model's effects change in some states of a capture; None for a model without effects.
+    """Changes by the model's effects in some states of a capture; None for a model without effects.
 
     Effects that belong to single captures (a slip, a drift) count only for those.
     """

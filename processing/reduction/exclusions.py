@@ -1,4 +1,4 @@
-"""What a diagnosis found to be no measurement of the sample: states, struck intensities and bad pixels, left out."""
+"""States, struck intensities and bad pixels that a diagnosis excludes: they do not measure the sample."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +14,7 @@ from processing.storage.captures.capture import Capture, CaptureError
 
 
 class _Entry(BaseModel):
-    """One capture's part, as `diagnose --json` has it; squares of `pitch` pixels are told by their first."""
+    """Exclusions of one capture in `diagnose --json`; the first pixel stands for a square of `pitch` pixels."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -27,7 +27,7 @@ class _Entry(BaseModel):
 
 @dataclass(frozen=True)
 class Exclusions:
-    """What a reduction leaves out.
+    """Parts of a capture that a reduction excludes.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Exclusions:
 
     @classmethod
     def read(cls, path: Path, capture: Capture) -> "Exclusions":
-        """From a result of `diagnose --json`; nothing where it tells of no such part of this capture.
+        """From a result of `diagnose --json`; empty if it lists no exclusion of this capture.
 
         Raises
         ------
@@ -71,7 +71,7 @@ class Exclusions:
         return cls(entry.states, hits, bad if bad.any() else None)
 
     def rest_of(self, states: NDArray[np.int64], path: Path) -> NDArray[np.int64]:
-        """Of the numbers (N,) of the states of the sample, those that are not left out.
+        """The numbers (N,) of the states of the sample that are not excluded.
 
         Raises
         ------
@@ -89,7 +89,7 @@ class Exclusions:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should know of whole states; pixels are told by the mask."""
+        """Warnings about whole states; the mask shows the pixels."""
         numbers = ", ".join(map(str, self.states))
         return (f"left out, because the others do not predict them: state(s) {numbers}",) if self.states else ()
 

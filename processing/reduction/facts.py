@@ -1,4 +1,4 @@
-"""What a reduction reports: numbers for the summary, and warnings that a user should act on."""
+"""Report of a reduction: numbers for the summary, and warnings that need an action."""
 
 from typing import Any
 

@@ -93,7 +93,7 @@ class FlatField:
 
 @dataclass(frozen=True)
 class FlatCapture:
-    """A capture of the flat field, and what says to which other captures it belongs."""
+    """A capture of the flat field, and the properties by which it belongs to other captures."""
 
     path: Path
     simulated: bool

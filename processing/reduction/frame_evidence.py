@@ -1,4 +1,4 @@
-"""What the frames of a capture say against a camera that reports something false.
+"""Evidence in the frames of a capture that the camera reports something false.
 
 A frame with noise never comes twice, and neither does a frame number or a time of the camera's clock. The brightness
 of a rotation is linear in the sixteen elements of the mean Mueller matrix, and so is each place of the picture. A state
@@ -54,7 +54,7 @@ MIRRORS: dict[str, Callable[[Array], Array]] = {
 
 @dataclass(frozen=True)
 class FrameFinding:
-    """Something that a frame says against what was reported of it.
+    """A contradiction between a frame and the reports about it.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class FrameEvidence:
     def look(
         self, state: int, pixels: NDArray[np.generic], *, number: int, camera_ns: int, exposure_s: float, light: bool
     ) -> list[FrameFinding]:
-        """What is new to report of a frame that is kept.
+        """New findings about a frame that is stored.
 
         Parameters
         ----------
@@ -140,7 +140,7 @@ class FrameEvidence:
         self._blocks.clear()
 
     def judge(self) -> list[FrameFinding]:
-        """What all light states of the run together say; new findings alone."""
+        """New findings from all light states of the run together."""
         if self._rows is None:
             return []
         states = np.array(sorted(self._blocks), dtype=int)
@@ -155,7 +155,7 @@ class FrameEvidence:
 
 
 def brightness_steps(states: NDArray[np.int64], rows: Array, light: Array) -> list[FrameFinding]:
-    """States that are brighter or darker by one factor than the others say, alone or from one on.
+    """States that are brighter or darker by one factor than the others predict: single ones, or all from one on.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def _outside(rows: Array) -> tuple[int, int, Array]:
 
 
 def _drifts(outside: Array, y: Array, step: float) -> bool:
-    """Whether light that drifts evenly explains as much as a step."""
+    """Whether a linear drift of the light explains as much as a step."""
     ramp = outside @ (y * np.linspace(-1, 1, len(y)))
     residual = outside @ y
     norm = float(ramp @ ramp)
@@ -341,7 +341,7 @@ def _common_variance(variances: Array, freedom: int) -> tuple[float, float]:
 
 
 def evidence_of(capture: Capture) -> tuple[str, ...]:
-    """What speaks against the frames of a capture, in words: what its runs reported, and what its columns say."""
+    """Evidence against the frames of a capture, in words: reports of its runs, and findings in its columns."""
     record = capture.closing.get("evidence")
     reported = [entry for entry in record if isinstance(entry, dict)] if isinstance(record, list) else []
     texts = [str(entry.get("text", "")) for entry in reported]

@@ -112,7 +112,7 @@ def seen_so_far(capture: Capture, lights: int) -> tuple[LitDarks, str | None]:
 
 
 def leaked_light(capture: Capture) -> str | None:
-    """Where the darks of a capture are brighter than its lights, or hold much of their light; None if neither.
+    """A warning if the darks of a capture are brighter than its light states, or hold much of their light; else None.
 
     Compared are the darks of one exposure with light states of the same, `ENOUGH_STATES` of them evenly chosen.
     """

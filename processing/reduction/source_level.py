@@ -119,7 +119,7 @@ class SourceMoments:
         return cls(products, pixels, channels) if pixels else None
 
     def levels(self, w: Array, basis: Array) -> SourceLevels | None:
-        """Levels for W (L, 16) of which `basis` (16, R) is determined; None where nothing is left over for them."""
+        """Levels for W (L, 16) of which `basis` (16, R) is determined; None without degrees of freedom for them."""
         determined = w @ basis
         rows, unknowns = determined.shape
         states = rows // self.channels
@@ -165,7 +165,7 @@ class SourceMoments:
 
 @dataclass(frozen=True)
 class LeveledSource:
-    """What a capture tells of the levels of its source; nothing where one channel sees it, or in one state."""
+    """Moments that determine the levels of a source; None for one channel or one state."""
 
     moments: SourceMoments | None
     basis: Array

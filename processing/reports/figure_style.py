@@ -1,4 +1,4 @@
-"""How figures look: panels of maps, colour maps for angles, what simulated data say of themselves."""
+"""Style of figures: panels of maps, colour maps for angles, and the mark of simulated data."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def clipped(values: NDArray[Any], low: float, high: float) -> str:
 
 
 def entitle(figure: Figure, title: str, simulated: bool) -> None:
-    """Put the title on a figure; simulated data say so in red."""
+    """Put the title on a figure; simulated data are marked in red."""
     figure.suptitle(
         f"{SIMULATED}   {title}" if simulated else title, color="darkred" if simulated else "black", fontsize=11
     )

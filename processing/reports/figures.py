@@ -141,7 +141,7 @@ def stokes_figure(maps: dict[str, NDArray[Any]], title: str, simulated: bool) ->
 
 
 def photon_transfer_figure(product: Product) -> Figure:
-    """Variance against signal with the fitted line, and what is left over."""
+    """Variance against signal with the fitted line, and the residual."""
     from matplotlib.figure import Figure
 
     signal, variance, stderr = product.array("photon_transfer")

@@ -92,7 +92,7 @@ class Xi0(FileStep):
             return product.kind == "stokes"
 
     def _by_model(self) -> bool:
-        """Whether the source holds less than whole matrices: the dominant process must be told."""
+        """Whether the source holds less than whole matrices: the user must then give the dominant process."""
         with Product(self.source) as product:
             return self._of_stokes() or int(product.facts.get("rank", 16)) < 16
 

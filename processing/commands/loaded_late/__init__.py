@@ -1,1 +1,1 @@
-"""What a command loads when it runs and not for its help: these modules import what is heavy at their top."""
+"""Modules that a command loads when it runs and not for its help: they import large packages at their top."""

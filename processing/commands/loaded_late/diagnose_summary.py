@@ -1,4 +1,4 @@
-"""What `diagnose` prints, and its result as a file."""
+"""The text that `diagnose` prints, and its result as a file."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -159,7 +159,7 @@ def _show_details(short: Mapping[str, str], d: Diagnosis) -> None:
 
 
 def _show_capture(short: Mapping[str, str], c: CaptureReport) -> None:
-    """What was left out of a capture."""
+    """Parts of a capture that were excluded."""
     of = f" of {short[c.name]}" if c.name in short else ""
     if c.cut_off:
         states = f"state{'s' if len(c.cut_off) > 1 else ''} {', '.join(str(k) for k in c.cut_off)}"
@@ -183,7 +183,7 @@ def _show_unexplained(short: Mapping[str, str], unexplained: Unexplained, rankin
 
 
 def _combination(c: Combination) -> str:
-    """Sum of values with its error, and by how much each may be off beside it."""
+    """Sum of values with its error, and the possible error of each value in addition."""
     terms = " ".join(f"{w:+.3g} {name}" for name, w in c.weights.items()).removeprefix("+1 ").removeprefix("+")
     unit = "" if c.unit == "1" else f" {c.unit}"
     alone = ", ".join(f"{v:+.2g}" for v in c.open_by.values())

@@ -1,4 +1,4 @@
-"""What `process import --dry-run` shows: the states as understood, and a strip of their frames."""
+"""Output of `process import --dry-run`: the states as understood, and a strip of their frames."""
 
 from itertools import islice
 

@@ -1,4 +1,4 @@
-"""What the effects of one retarder of one train share."""
+"""Base of the effects of one retarder of one train."""
 
 from collections.abc import Sequence
 from typing import ClassVar, Literal

@@ -13,7 +13,7 @@ from processing.instrument.model import InstrumentModel
 
 
 class SentenceEffect(OpticsEffect):
-    """What can be wrong and has no name of its own."""
+    """An effect that a sentence of the grammar describes, because the list has no name for it."""
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(s.text for s in grammar.sentences(model, conditions) if s.of_one_capture == self.of_one_capture)

@@ -25,7 +25,7 @@ class InstrumentEffect(Effect, ABC):
     reference: ClassVar[str | None] = None
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        """Where it can act in this instrument: element, axis or channel names; ("",) for the whole; () for nowhere."""
+        """Places of the effect: element, axis or channel names; ("",) for the whole; () for nowhere."""
         return ("",)
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:

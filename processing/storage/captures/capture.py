@@ -343,7 +343,7 @@ class Capture(OpenH5):
 
 
 def made_of_captures(path: Path) -> bool:
-    """Whether a file is what `process` makes of captures, and so lies beside them: a product, or a table."""
+    """Whether `process` made the file of captures: a product, or a table, which lies next to them."""
     return any(mark_of(path, mark) is not None for mark in MADE_OF_CAPTURES)
 
 

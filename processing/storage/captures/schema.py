@@ -333,12 +333,12 @@ def write_closing(h5: h5py.File, status: Status, closing: Mapping[str, Any]) -> 
 
 
 def write_status(h5: h5py.File, status: Status) -> None:
-    """Replace the status in its place: nothing else of the file changes."""
+    """Overwrite the status in the file; nothing else changes."""
     h5["entry"].attrs.modify("status", np.array(status.encode(), dtype=STATUS_TYPE))
 
 
 def fitted_json(closing: Mapping[str, Any], room: int) -> bytes:
-    """JSON in at most `room` bytes; `left_out` tells entries of lists, characters of texts and whole values cut.
+    """JSON in at most `room` bytes; `left_out` counts the list entries, characters and values that were cut.
 
     Where not even that fits it is an empty record.
     """

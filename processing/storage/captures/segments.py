@@ -18,7 +18,7 @@ from processing.section import Section
 
 
 class Identity(Section):
-    """What a run was made with, as digests (SHA-256) and as the devices told it.
+    """Configuration of a run, as digests (SHA-256) and as the devices reported it.
 
     `files` are the files that rig and plan name, by their key; `devices` the properties of each device that must not
     change within a capture: kind, model, serial number, firmware.
@@ -86,7 +86,7 @@ def decode_lines(raw: bytes) -> tuple[list[dict[str, Any]], int]:
 
 
 def segments_of(records: list[dict[str, Any]], segment_of_state: NDArray[np.integer[Any]]) -> tuple[Segment, ...]:
-    """The segments that a journal tells of; a file without a journal has one, which took every state."""
+    """The segments in a journal; a file without a journal has one segment with every state."""
     begun = [record for record in records if record["event"] == "begin"]
     ended = {record["segment"]: record for record in records if record["event"] == "end"}
     if not begun:

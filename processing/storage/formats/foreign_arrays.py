@@ -80,7 +80,7 @@ def read_column(text: str) -> NDArray[np.float64]:
 
 
 def stated_unit(text: str) -> str:
-    """What says in which unit numbers are: the header of a column, or the attribute `units` of a dataset."""
+    """Source of the unit of numbers: the header of a column, or the attribute `units` of a dataset."""
     if not is_array(text):
         return text
     match = _ADDRESS.fullmatch(text)

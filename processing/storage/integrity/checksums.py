@@ -1,4 +1,4 @@
-"""Checksums of a capture: one for each row of each frame, one for everything else that a state says.
+"""Checksums of a capture: one for each row of each frame, one for all other values of a state.
 
 They are written once, with the state, and verified wherever the state is read. A row has its own so that a reader of a
 few rows need not read the whole frame.

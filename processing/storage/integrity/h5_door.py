@@ -48,7 +48,7 @@ def open_h5(path: Path, error: type[ProcessError], hint: str = "") -> h5py.File:
 
 
 def _require_own(h5: h5py.File) -> None:
-    """Raise ValueError where a part of a file lies in another one: that may be a pipe, or what nobody meant to give."""
+    """Raise ValueError if a part of a file lies in another file: that may be a pipe, or private data."""
     count = 0
 
     # The low-level interface makes no object for a part: a quarter of the time of `visititems_links`.

@@ -42,7 +42,7 @@ HEAD, END, MOST_STORED = b"\x78\x01", b"\x01\x00\x00\xff\xff", 0xFFFF
 
 @dataclass(frozen=True)
 class Packing:
-    """How a dataset is packed, told from parts of it.
+    """Packing of a dataset, chosen from samples of it.
 
     Attributes
     ----------

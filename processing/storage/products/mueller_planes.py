@@ -1,4 +1,4 @@
-"""The planes of a Mueller product: what every image of Mueller matrices holds beside the matrices."""
+"""The planes of a Mueller product: the planes of every image of Mueller matrices in addition to the matrices."""
 
 import numpy as np
 

@@ -75,7 +75,7 @@ class ProductError(ProcessError):
 
 @dataclass(frozen=True)
 class Plane:
-    """One dataset of a product: leading shape before (rows, columns), type, unit and a line that says what it is."""
+    """One dataset of a product: leading shape before (rows, columns), type, unit and a line of description."""
 
     leading: tuple[int, ...]
     units: str

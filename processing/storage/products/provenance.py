@@ -79,18 +79,18 @@ def file_identity(path: Path, role: str = "") -> dict[str, Any]:
 
 
 def content_of(identity: Mapping[str, Any]) -> str | None:
-    """What stands for the content in an identity; None where it does not say."""
+    """The field of an identity that represents the content; None without one."""
     return next((str(identity[kind]) for kind in CONTENTS if identity.get(kind)), None)
 
 
 def made_of(path: Path) -> str | None:
-    """`Step.made_of` of a product; None for a file that is not there, or does not say."""
+    """`Step.made_of` of a product; None for a file that does not exist or has no such mark."""
     mark = mark_of(path, MADE_OF)
     return None if mark is None else str(mark)
 
 
 def sign(h5: h5py.File, steps: Sequence[Step]) -> None:
-    """Store what a product was made of; nothing for a step that does not say its inputs."""
+    """Store the inputs of a product; nothing for a step without recorded inputs."""
     if steps and steps[-1].inputs:
         h5.attrs[MADE_OF] = steps[-1].made_of
 
