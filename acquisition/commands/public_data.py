@@ -38,7 +38,7 @@ def get_command(
 ) -> None:
     """Download a set (or find it in the folder UMOV_DATA), check its SHA-256, and make captures of it."""
     from acquisition.commands.defaults import CONFIGS
-    from processing.commands.batch import Made, run_batch
+    from processing.commands.batch import Output, run_batch
     from processing.commands.progress_bar import progress_bar
     from processing.public_data.conversion import tables_of
     from processing.public_data.sets import catalogue, get_files
@@ -60,11 +60,11 @@ def get_command(
     folder.mkdir(parents=True, exist_ok=True)
     instrument = CONFIGS / "instruments" / entry.instrument
 
-    def make(capture: Path, progress: object) -> Made:
+    def make(capture: Path, progress: object) -> Output:
         table = tables[capture]
         states, is_same = table.write(folder)
         if is_same and capture.exists():
-            return Made((capture,), True)
+            return Output((capture,), True)
         request = ImportRequest(
             states=states,
             out=capture,
@@ -74,7 +74,7 @@ def get_command(
             title=f"{name}, {table.name}",
         )
         import_capture(request)
-        return Made((capture,), False)
+        return Output((capture,), False)
 
     run_batch("importing", "states", list(tables), make)
     first = next((path for path, table in tables.items() if table.sample != "unknown"), next(iter(tables)))

@@ -102,4 +102,4 @@ def curve_point(task: CurveTask) -> CurvePoint:
     output = reduction.found_or_made(task.out / f"{path.stem}.{task.capture.kind}.h5")
     with Product(output.path) as product:
         region = parse_region(task.region, product.shape)
-    return CurvePoint(task.capture, output.path, output.was_there, tuple(mean_of([output.path], region)))
+    return CurvePoint(task.capture, output.path, output.existed, tuple(mean_of([output.path], region)))

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from processing.commands.batch import Made, files_of, place_for, run_batch, written_if_changed
+from processing.commands.batch import Output, files_of, place_for, run_batch, written_if_changed
 from processing.commands.command_line import command
 from processing.commands.product_options import Overwrite, ProductFile
 from processing.commands.purposes import DATA, EXPORT
@@ -31,12 +31,12 @@ def from_axostep_command(
     inputs = files_of(sources, lambda path: True, "AxoStep images", (".cmmi", ".bmmi"))
     place = place_for(inputs, out)
 
-    def make(source: Path, _: object) -> Made:
+    def make(source: Path, _: object) -> Output:
         target = place(source.with_suffix(".mueller.h5"))
         facts, is_unchanged = product_of_axostep(source, target, wavelength_nm, omega_deg, overwrite=overwrite)
-        return Made((target,), is_unchanged, "".join(f"  {fact}" for fact in facts))
+        return Output((target,), is_unchanged, "".join(f"  {fact}" for fact in facts))
 
-    def print_result(output: Made) -> None:
+    def print_result(output: Output) -> None:
         typer.echo(f"{output.facts.strip()}\n{output.paths[0]}")
 
     run_batch("reading", "files", inputs, make, print_result=print_result)
@@ -63,7 +63,7 @@ def to_axostep_command(
     inputs = files_of(sources, is_mueller, "Mueller products")
     place = place_for(inputs, out)
 
-    def make(source: Path, _: object) -> Made:
+    def make(source: Path, _: object) -> Output:
         target = place(source.with_suffix("").with_suffix(".bmmi"))
 
         def write(name: Path) -> list[Path]:

@@ -18,10 +18,10 @@ from processing.commands.summary import one_line, print_warnings, summary
 from processing.errors import ProcessError
 
 if TYPE_CHECKING:
-    from processing.steps.file_step import FileStep, Found, Progress
+    from processing.steps.file_step import FileStep, Progress, StepProduct
 
 
-class Made(NamedTuple):
+class Output(NamedTuple):
     """Files that one input became; `is_unchanged`: they existed, made of the same inputs with the same options."""
 
     paths: tuple[Path, ...]
@@ -33,9 +33,9 @@ def run_batch(
     action: str,
     unit: str,
     inputs: Sequence[Path],
-    make: Callable[[Path, Progress], Made],
+    make: Callable[[Path, Progress], Output],
     *,
-    print_result: Callable[[Made], None] | None = None,
+    print_result: Callable[[Output], None] | None = None,
     word: str = "made",
 ) -> None:
     """Make the files of every input.
@@ -97,7 +97,7 @@ def make_products(
     action: str,
     unit: str,
     inputs: Sequence[Path],
-    step_of: Callable[[Path, Progress], tuple[FileStep, Found | None]],
+    step_of: Callable[[Path, Progress], tuple[FileStep, StepProduct | None]],
     *,
     out: Path | None,
     overwrite: bool,
@@ -119,10 +119,10 @@ def make_products(
     if several and figure is not None:
         raise ProcessError(f"--figure {figure}: one file for {len(inputs)} inputs. Leave it out: each gets its own.")
     place = place_for(inputs, out)
-    first: list[Found] = []
+    first: list[StepProduct] = []
     sources: dict[str, Path] = {}
 
-    def make(source: Path, tick: Progress) -> Made:
+    def make(source: Path, tick: Progress) -> Output:
         step, start = step_of(source, tick)
         target = place(step.usual_path)
         if (first_source := sources.setdefault(os.path.realpath(target), source)) != source:
@@ -130,17 +130,17 @@ def make_products(
         product = step.kept_or_made(target, overwrite, tick)
         if not several:
             first.extend([start] if start else [])
-            return Made((product.path,), product.was_there)
+            return Output((product.path,), product.existed)
         for result in (start, product):
-            if result is not None and not (result is start and result.was_there):
+            if result is not None and not (result is start and result.existed):
                 print_warnings(result.path, f"{result.path.name}: ")
-        if not (product.was_there and product.path.with_suffix(".png").exists()):
+        if not (product.existed and product.path.with_suffix(".png").exists()):
             draw(product.path, None, no_figure, silent=True)
-        return Made((product.path,), product.was_there, one_line(product.path))
+        return Output((product.path,), product.existed, one_line(product.path))
 
-    def print_result(output: Made) -> None:
+    def print_result(output: Output) -> None:
         for start in first:
-            typer.echo(f"using {start.path}") if start.was_there else summary(start.path)
+            typer.echo(f"using {start.path}") if start.existed else summary(start.path)
         summary(output.paths[0])
         draw(output.paths[0], figure, no_figure)
 
@@ -164,7 +164,7 @@ def place_for(inputs: Sequence[Path], out: Path | None) -> Callable[[Path], Path
     return lambda usual: out / usual.name
 
 
-def written_if_changed(target: Path, overwrite: bool, write: Callable[[Path], Sequence[Path]]) -> Made:
+def written_if_changed(target: Path, overwrite: bool, write: Callable[[Path], Sequence[Path]]) -> Output:
     """Files for other programs, which do not record their inputs: written again, and compared byte for byte.
 
     Parameters
@@ -186,12 +186,12 @@ def written_if_changed(target: Path, overwrite: bool, write: Callable[[Path], Se
         targets = [target.with_name(path.name) for path in written]
         pairs = list(zip(written, targets, strict=True))
         if all(old.is_file() and filecmp.cmp(new, old, shallow=False) for new, old in pairs):
-            return Made(tuple(targets), True)
+            return Output(tuple(targets), True)
         for path in targets:
             require_place(path, overwrite)
         for new, old in pairs:
             os.replace(new, os.path.realpath(old))
-    return Made(tuple(targets), False)
+    return Output(tuple(targets), False)
 
 
 def files_of(

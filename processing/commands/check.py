@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from processing.commands.batch import Made, files_of, run_batch
+from processing.commands.batch import Output, files_of, run_batch
 from processing.commands.command_line import command
 from processing.commands.purposes import CALIBRATION
 
@@ -42,14 +42,14 @@ def check_command(
     inputs = files_of(captures, takes, f"captures to compare with {reference}")
     changes: dict[Path, Change] = {}
 
-    def make(capture: Path, tick: Progress) -> Made:
+    def make(capture: Path, tick: Progress) -> Output:
         require_distinct([capture, reference])
         change = changes[capture] = compare(capture, reference, instrument, tolerance, progress=tick)
-        top, several = change.largest, len(inputs) > 1
+        top, many = change.largest, len(inputs) > 1
         table = keep(change, reference)
-        return Made((capture if several else table,), several and not change.count, f"  {top.name} by {top.value:+.2g}")
+        return Output((capture if many else table,), many and not change.count, f"  {top.name} by {top.value:+.2g}")
 
-    def print_result(output: Made) -> None:
+    def print_result(output: Output) -> None:
         (change,), (table,) = changes.values(), output.paths
         _print_change(change, reference, tolerance)
         typer.echo(f"{table}\n{table.with_suffix('.png')}")

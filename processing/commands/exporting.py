@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from processing.commands.batch import Made, files_of, place_for, run_batch, written_if_changed
+from processing.commands.batch import Output, files_of, place_for, run_batch, written_if_changed
 from processing.commands.command_line import command
 from processing.commands.purposes import EXPORT
 
@@ -38,7 +38,7 @@ def export_command(
     inputs = files_of(sources, takes, f"products with {', '.join(plane)}" if plane else "products")
     place = place_for(inputs, out)
 
-    def make(source: Path, _: object) -> Made:
+    def make(source: Path, _: object) -> Output:
         target = place(source.with_suffix(""))
         return written_if_changed(target, overwrite, lambda name: export(source, to, name, plane or ()))
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from processing.commands.batch import Made, files_of, place_for, run_batch
+from processing.commands.batch import Output, files_of, place_for, run_batch
 from processing.commands.command_line import command
 from processing.commands.purposes import DATA
 from processing.commands.recipe import read_recipe, recipe_text
@@ -142,22 +142,22 @@ def import_command(
         return
     sources: dict[Path, Path] = {}
 
-    def make(item: Path, tick: Progress) -> Made:
+    def make(item: Path, tick: Progress) -> Output:
         job = requests[item]
         if (twin := sources.setdefault(job.out, item)) != item:
             raise ProcessError(f"its capture {job.out} is that of {twin} too. Import one of them with another --out.")
         file, text = job.out.with_suffix(".import.yaml"), recipe_text(context, job)
         is_same = file.is_file() and file.read_text(encoding="utf-8", errors="replace") == text
         if is_same and not overwrite and is_imported(job):
-            return Made((job.out,), True)
+            return Output((job.out,), True)
         import_capture(job, tick)
         write_whole_text(file, text)
-        return Made((job.out,), False)
+        return Output((job.out,), False)
 
     run_batch("importing", "states", list(requests), make, print_result=_print_imported)
 
 
-def _print_imported(output: Made) -> None:
+def _print_imported(output: Output) -> None:
     from processing.storage.captures.capture import Capture
 
     (path,) = output.paths
@@ -199,8 +199,8 @@ def colours_command(
 
     inputs = files_of(captures, has_colours, "captures of a colour sensor")
 
-    def make(capture: Path, _: object) -> Made:
+    def make(capture: Path, _: object) -> Output:
         paths, is_unchanged = split_colours(capture, out or capture.parent)
-        return Made(tuple(paths), is_unchanged)
+        return Output(tuple(paths), is_unchanged)
 
     run_batch("splitting", "captures", inputs, make)

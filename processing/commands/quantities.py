@@ -15,7 +15,7 @@ from processing.commands.purposes import IMAGES
 
 if TYPE_CHECKING:
     from processing.polarization.quantities import NamedStokes
-    from processing.steps.file_step import FileStep, Found, Progress
+    from processing.steps.file_step import FileStep, Progress, StepProduct
 
 
 @command("quantities", IMAGES)
@@ -47,7 +47,7 @@ def quantities_command(
     # Before a capture is reduced for nothing.
     require_decompositions(also or ())
 
-    def step_of(source: Path, tick: Progress) -> tuple[FileStep, Found | None]:
+    def step_of(source: Path, tick: Progress) -> tuple[FileStep, StepProduct | None]:
         image = reduced(source, instrument, tick)
         return Quantities(image.path, tuple(also or ()), pairs), image if image.path != source else None
 

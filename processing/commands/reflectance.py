@@ -16,7 +16,7 @@ from processing.whole_file import whole_file
 
 if TYPE_CHECKING:
     from processing.calibration.illumination_design import Assumptions
-    from processing.steps.file_step import FileStep, Found, Progress
+    from processing.steps.file_step import FileStep, Progress, StepProduct
 
 
 def design_stokes(geometry: Path, material: Path, camera: Path, scene: Assumptions, *, figure: Path) -> None:
@@ -102,7 +102,7 @@ def extrapolate_command(
     from processing.steps.maps import Extrapolation
     from processing.steps.reduction import reduced
 
-    def step_of(source: Path, tick: Progress) -> tuple[FileStep, Found | None]:
+    def step_of(source: Path, tick: Progress) -> tuple[FileStep, StepProduct | None]:
         image = reduced(source, progress=tick)
         return Extrapolation(image.path, geometry, material), image if image.path != source else None
 

@@ -14,7 +14,7 @@ from processing.commands.product_options import Overwrite, ProductFile
 from processing.commands.purposes import IMAGES
 
 if TYPE_CHECKING:
-    from processing.steps.file_step import FileStep, Found, Progress
+    from processing.steps.file_step import FileStep, Progress, StepProduct
 
 
 @command("xi0", IMAGES)
@@ -41,7 +41,7 @@ def xi0_command(
     from processing.storage.products.images import seen_elements
     from processing.storage.products.product import Product
 
-    def step_of(source: Path, tick: Progress) -> tuple[FileStep, Found | None]:
+    def step_of(source: Path, tick: Progress) -> tuple[FileStep, StepProduct | None]:
         image = reduced(source, instrument, tick)
         with Product(image.path) as product:
             if product.kind == "mueller" and seen_elements(product.facts).all() and (geometry or material):

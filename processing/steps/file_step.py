@@ -16,11 +16,11 @@ from processing.storage.products.provenance import Step, made_of
 Progress = Callable[[int, int], None]
 
 
-class Found(NamedTuple):
+class StepProduct(NamedTuple):
     """A product, and whether it was there already."""
 
     path: Path
-    was_there: bool
+    existed: bool
 
 
 class OfFiles:
@@ -71,18 +71,18 @@ class FileStep(OfFiles, ABC):
 
     def kept_or_made(
         self, out: Path | str | None = None, overwrite: bool = False, progress: Progress | None = None
-    ) -> Found:
+    ) -> StepProduct:
         """The product at `out` (default: the usual path): kept if it is exactly this one, else made as by `make`.
 
         `overwrite` makes it in any case. Raises ProcessError as `make` does.
         """
         out = Path(out) if out else self.usual_path
         if not overwrite and out.is_file() and made_of(out) == self.record().made_of:
-            return Found(out, True)
-        return Found(self.make(out, overwrite, progress), False)
+            return StepProduct(out, True)
+        return StepProduct(self.make(out, overwrite, progress), False)
 
     @one_blas_thread()
-    def found_or_made(self, path: Path | str | None = None, progress: Progress | None = None) -> Found:
+    def found_or_made(self, path: Path | str | None = None, progress: Progress | None = None) -> StepProduct:
         """The product, made now unless `path` (default: the usual one) holds exactly it.
 
         No file is ever replaced: where the name is taken by anything else, the product gets one of its own that ends
@@ -93,11 +93,11 @@ class FileStep(OfFiles, ABC):
         own_path = path.with_name(f"{path.stem}-{content[:8]}{path.suffix}")
         for candidate in (path, own_path):
             if made_of(candidate) == content:
-                return Found(candidate, True)
+                return StepProduct(candidate, True)
         target = own_path if path.exists() else path
         require_place(target, overwrite=False)
         self._write(target, record, False, progress)
-        return Found(target, False)
+        return StepProduct(target, False)
 
 
 def beside(source: Path, kind: str) -> Path:

@@ -13,7 +13,7 @@ from processing.reduction.flat import flat_captures, nearest_flat
 from processing.reduction.instrument_of_capture import choose_model
 from processing.reduction.mueller import reduce_mueller
 from processing.reduction.mueller_reduction import Choice
-from processing.steps.file_step import FileStep, Found, Progress
+from processing.steps.file_step import FileStep, Progress, StepProduct
 from processing.storage.captures.capture import Capture
 from processing.storage.products.product import is_product
 from processing.storage.products.provenance import Step, file_identity
@@ -152,7 +152,7 @@ class Reduction(FileStep):
             )
 
 
-def reduced(source: Path, instrument: Path | None = None, progress: Progress | None = None) -> Found:
+def reduced(source: Path, instrument: Path | None = None, progress: Progress | None = None) -> StepProduct:
     """A product as it is; for a capture its plain product, found or made.
 
     Raises
@@ -164,7 +164,7 @@ def reduced(source: Path, instrument: Path | None = None, progress: Progress | N
         return Reduction(source, instrument).found_or_made(progress=progress)
     if instrument is not None:
         raise ProcessError(f"{source} is reduced already; --instrument is for a capture. Leave it away.")
-    return Found(source, True)
+    return StepProduct(source, True)
 
 
 def _default_method() -> str:

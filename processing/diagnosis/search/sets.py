@@ -126,7 +126,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class SetFit:
     """Posterior of the parameters of one set: which `active` (A,), mean (A,), covariance (A, A), and how likely.
 
     `excess` is that of the fit (the cost of the prior included), `score` the log probability of the set.
@@ -140,7 +140,7 @@ class Fitted:
 
 
 @dataclass(frozen=True)
-class Conditional(Fitted):
+class Conditional(SetFit):
     """The same, with what it says of every group given the others: log odds (G,), and weights (G, T) of each tau."""
 
     log_odds: Array
@@ -219,7 +219,7 @@ class Sets:
         beside = np.where(self.alone, (is_included & self.alone).sum() - (is_included & self.alone), 0.0)
         return np.asarray(np.log((1 + other_count) / absent_count / self.share) - self.price) + NEVER * beside
 
-    def fitted(self, state: State) -> Fitted:
+    def fitted(self, state: State) -> SetFit:
         """Posterior of the parameters that are there."""
         return self._solved(state)[0]
 
@@ -236,7 +236,7 @@ class Sets:
         prior = np.concatenate([np.zeros(0), *(np.full(self.groups[i].index.size, state.tau[i] ** -2.0) for i in on)])
         return active, prior, _root(self.form.curvature[np.ix_(active, active)] / state.unit + np.diag(prior))
 
-    def _solved(self, state: State) -> tuple[Fitted, Array, Array]:
+    def _solved(self, state: State) -> tuple[SetFit, Array, Array]:
         u, tau = state.unit, state.tau
         active, prior, lower = self._factored(state)
         inverse = solve_triangular(lower, np.eye(active.size), lower=True) if active.size else lower
@@ -245,7 +245,7 @@ class Sets:
         # What the width of the prior costs: log det (I + T H / u).
         width = 2 * float(np.log(np.diag(lower)).sum()) - float(np.log(prior).sum())
         score = self.noise.log_likelihood(excess) - 0.5 * width + self._log_prior(tau)
-        return Fitted(active, -inverse.T @ right, inverse.T @ inverse, excess, score), inverse, right
+        return SetFit(active, -inverse.T @ right, inverse.T @ inverse, excess, score), inverse, right
 
     def conditional(self, state: State, *, follow: bool = False) -> Conditional:
         """Posterior of the parameters that are there, and odds of every group given the others.
@@ -275,7 +275,7 @@ class Sets:
         return Conditional(**vars(fit), log_odds=log_odds, tau_weights=weights)
 
     def _cavities(
-        self, state: State, fit: Fitted, inverse: Array, right: Array
+        self, state: State, fit: SetFit, inverse: Array, right: Array
     ) -> Iterator[tuple[NDArray[np.int64], Array, Array]]:
         """Groups of one size, with curvature (G, n, n) and gradient (G, n) about zero given all other groups."""
         u = state.unit

@@ -37,7 +37,7 @@ TOGETHER = 0.9
 OPEN = 5.0
 
 
-class Captured(Protocol):
+class CaptureInfo(Protocol):
     """What is told of every capture."""
 
     @property
@@ -48,13 +48,13 @@ class Captured(Protocol):
     def wavelength_nm(self) -> float: ...
 
 
-class Asked(Problem, Protocol):
+class DiagnosisProblem(Problem, Protocol):
     """A problem that an answer belongs to; `held_out` says in words what is predicted by what."""
 
     model: InstrumentModel
 
     @property
-    def captures(self) -> Sequence[Captured]: ...
+    def captures(self) -> Sequence[CaptureInfo]: ...
     @property
     def held_out(self) -> str: ...
 
@@ -131,7 +131,7 @@ def combinations(posterior: Posterior, solved: Solution) -> tuple[Combination, .
     return tuple(result)
 
 
-def error(problem: Asked, solved: Solution, held_out: HeldOut, k: int | None = None) -> Error:
+def error(problem: DiagnosisProblem, solved: Solution, held_out: HeldOut, k: int | None = None) -> Error:
     """A residual as it is told, of one capture `k` or of all, in the unit of the counts as they were taken."""
     noise, rms, beyond = floor(problem, solved, k), 100 * held_out.rms, None
     if noise is not None:
@@ -140,14 +140,14 @@ def error(problem: Asked, solved: Solution, held_out: HeldOut, k: int | None = N
     return Error(rms_percent=rms, chi2_reduced=held_out.chi2_reduced, held_out=problem.held_out, beyond_noise=beyond)
 
 
-def floor(problem: Asked, solved: Solution, k: int | None = None) -> float | None:
+def floor(problem: DiagnosisProblem, solved: Solution, k: int | None = None) -> float | None:
     """Rms noise over the mean signal, percent, of the counts as they were taken: of one capture or of all."""
     if not problem.noise_known:
         return None
     return 100 * problem.noise_floor(solved.base, solved.before_fit.values, k)
 
 
-def stretch(problem: Asked, solved: Solution, k: int | None = None) -> float:
+def stretch(problem: DiagnosisProblem, solved: Solution, k: int | None = None) -> float:
     """By how much a bend of the response that is undone stretches noise, and residual, relative to the signal."""
     if not problem.noise_known:
         return 1.0
@@ -155,7 +155,7 @@ def stretch(problem: Asked, solved: Solution, k: int | None = None) -> float:
     return problem.noise_floor(solved.space, solved.fit.values, k) / before if before > 0 else 1.0
 
 
-def held_out_without(problem: Asked, solved: Solution, effects: Collection[Candidate]) -> HeldOut:
+def held_out_without(problem: DiagnosisProblem, solved: Solution, effects: Collection[Candidate]) -> HeldOut:
     """What the correction would leave without some of its effects; for each degree of freedom, as after it."""
     values = solved.fit.values.copy()
     for candidate, part in solved.space.pairs:
@@ -167,7 +167,7 @@ def held_out_without(problem: Asked, solved: Solution, effects: Collection[Candi
 
 
 def effects_of_cause(
-    problem: Asked, solved: Solution, cause: Cause, doubt: str | None, *, not_applied: str | None
+    problem: DiagnosisProblem, solved: Solution, cause: Cause, doubt: str | None, *, not_applied: str | None
 ) -> list[FoundEffect]:
     """A cause as it is told, given a reason to doubt it; one for each capture in which it shows."""
     without = held_out_without(problem, solved, (*cause.candidates, *cause.alternatives))
@@ -207,7 +207,7 @@ def effects_of_cause(
     return effects
 
 
-def effects_of_switches(problem: Asked, solved: Solution) -> list[FoundEffect]:
+def effects_of_switches(problem: DiagnosisProblem, solved: Solution) -> list[FoundEffect]:
     """Pixels that are left out because what they say is another thing than the others say."""
     effects = []
     for candidate, part in solved.space.pairs:
@@ -219,7 +219,7 @@ def effects_of_switches(problem: Asked, solved: Solution) -> list[FoundEffect]:
     return effects
 
 
-def _wavelength(problem: Asked, candidate: Candidate) -> float | None:
+def _wavelength(problem: DiagnosisProblem, candidate: Candidate) -> float | None:
     """Wavelength at which the values hold; None for all of them."""
     several = {c.wavelength_nm for c in problem.captures}
     effect = candidate.of_instrument
@@ -248,7 +248,7 @@ def ranking(posterior: Posterior, before: HeldOut) -> tuple[Ranked, ...]:
     )
 
 
-def unobservable(problem: Asked, posterior: Posterior) -> list[Candidate]:
+def unobservable(problem: DiagnosisProblem, posterior: Posterior) -> list[Candidate]:
     """Candidates about which the captures say nothing, the nominal values being free."""
     precision, always = information(posterior)
     unseen = []
@@ -266,7 +266,7 @@ def unobservable(problem: Asked, posterior: Posterior) -> list[Candidate]:
     return unseen
 
 
-def checks(problem: Asked, solved: Solution) -> tuple[Check, ...]:
+def checks(problem: DiagnosisProblem, solved: Solution) -> tuple[Check, ...]:
     """Held-out residual, rank and condition of W, before and after: if one gets worse, it is no explanation."""
     figures = [held_out_check(solved, stretch(problem, solved))]
     several = len(problem.captures) > 1
@@ -288,7 +288,7 @@ class Answer:
     `problem` is what the correction predicts.
     """
 
-    problem: Asked
+    problem: DiagnosisProblem
     posterior: Posterior
     solved: Solution
     names: Names

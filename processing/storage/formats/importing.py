@@ -41,7 +41,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class Understood:
+class ImportPlan:
     """States and frames as they were read, before anything is written."""
 
     states: StatesFile
@@ -49,7 +49,7 @@ class Understood:
     model: InstrumentModel | None
 
 
-def understand(request: ImportRequest) -> Understood:
+def understand(request: ImportRequest) -> ImportPlan:
     """Read the states, and find their frames.
 
     Raises
@@ -97,7 +97,7 @@ def understand(request: ImportRequest) -> Understood:
     source = source_of(request, states, places, names, has_model=model is not None)
     if request.darks is not None:
         states, source = with_darks(request.darks, states, source)
-    return Understood(states, source, model)
+    return ImportPlan(states, source, model)
 
 
 def is_imported(request: ImportRequest) -> bool:
@@ -112,7 +112,7 @@ def is_imported(request: ImportRequest) -> bool:
     return all(file.stat().st_mtime_ns < written_ns for file in _files_of(request, understand(request)))
 
 
-def _files_of(request: ImportRequest, understood: Understood) -> list[Path]:
+def _files_of(request: ImportRequest, understood: ImportPlan) -> list[Path]:
     """Files that a capture is made of."""
     texts = (request.stack, request.darks, request.states, request.instrument, *request.columns.values())
     files = [*understood.source.files]
