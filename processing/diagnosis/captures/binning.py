@@ -66,7 +66,7 @@ def _any(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
 
 
 def _shared(shared: SharedNoise, side: int) -> SharedNoise:
-    """What squares have of their noise in common: neighbours less than pixels, lines more."""
+    """Shared noise of squares: neighbours share less than pixels do, lines more."""
     return replace(
         shared,
         right=_mixed(shared.right, side),

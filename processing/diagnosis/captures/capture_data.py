@@ -21,7 +21,7 @@ STRIP_ROWS = 16
 
 @dataclass(frozen=True)
 class SharedNoise:
-    """What the noise of one pixel has in common with that of others, as the frames were stored.
+    """Correlation of the noise of a pixel with that of others, as the frames were stored.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class SharedNoise:
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """What is no measurement of the sample, and is left out.
+    """Parts of a capture that do not measure the sample and are excluded.
 
     Attributes
     ----------

@@ -123,7 +123,7 @@ WEAK = 1e-3
 
 @dataclass(frozen=True)
 class DetectorNoise:
-    """What the images show.
+    """Noise of the detector as the images show it.
 
     Attributes
     ----------

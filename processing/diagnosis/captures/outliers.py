@@ -165,7 +165,7 @@ class _Moments:
         return np.asarray(np.eye(len(rows)) - q @ q.T)
 
     def _fitted(self, states: Sequence[int]) -> tuple[Array, Array]:
-        """What (L', L') a fit to some states leaves of their rows, and their second moments (L', L') beyond noise."""
+        """Projector (L', L') on the residual of a fit to some states, and second moments (L', L') beyond noise."""
         rows = self._rows(states)
         return self._outside(rows), self._products[np.ix_(rows, rows)] - np.diag(self._noise[rows])
 
@@ -219,7 +219,7 @@ LEAST_FREE = 1e-6
 
 @dataclass(frozen=True)
 class Outliers:
-    """What is left out: `hits` (N, channels, rows, columns) single intensities, `bad` (rows, columns) pixels."""
+    """Excluded data: `hits` (N, channels, rows, columns) single intensities, `bad` (rows, columns) pixels."""
 
     hits: NDArray[np.bool_]
     bad: NDArray[np.bool_]

@@ -47,7 +47,7 @@ FEW_PIXELS = 64
 
 @dataclass(frozen=True)
 class Frames:
-    """What was read.
+    """Frames of a capture as they were read.
 
     Attributes
     ----------
@@ -237,7 +237,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
 
 
 def _places_px(model: InstrumentModel, side: int) -> Array | None:
-    """Where each channel of a mosaic looks (channels, 2), from the middle of a super-pixel, in pixels as read."""
+    """Position of each channel of a mosaic (channels, 2), from the middle of a super-pixel, in pixels as read."""
     if model.mosaic is None:
         return None
     where = {name: (c, r) for r, line in enumerate(model.mosaic) for c, name in enumerate(line)}

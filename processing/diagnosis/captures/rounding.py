@@ -36,7 +36,7 @@ NOT_NORMAL = 0.2
 
 
 def rounded_off(counts: NDArray[np.float32], noise: float, *, image: bool = True) -> tuple[float, float, float]:
-    """What rounding does to the counts of a frame.
+    """Effect of rounding on the counts of a frame.
 
     The intensities before rounding are taken as normal. The share of pixels with each whole count gives their mean and
     spread. If all pixels have one count, the mean is known to within a part of a count only.
@@ -76,7 +76,7 @@ def rounded_off(counts: NDArray[np.float32], noise: float, *, image: bool = True
 
 
 class Rounding:
-    """What the rounding of a capture's counts takes from the mean of each frame above black.
+    """Change of the mean of each frame above black by the rounding of a capture's counts.
 
     Attributes
     ----------

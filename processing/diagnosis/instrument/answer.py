@@ -1,4 +1,4 @@
-"""What an answer tells of an instrument alone: nominal values, captures, what was left out, and the noise."""
+"""Parts of an answer about an instrument alone: nominal values, captures, excluded data, and the noise."""
 
 import numpy as np
 
@@ -62,7 +62,7 @@ def _by_wavelength(values: dict[float, tuple[float, float]], unit: str) -> Effec
 
 
 def missing(unseen: list[Candidate]) -> list[Candidate]:
-    """Of what is unobservable, what another sample could show."""
+    """Unobservable candidates that another sample could show."""
     return [c for c in unseen if not (c.acts_on_counts or c.effect.varies_over_image)]
 
 

@@ -27,7 +27,7 @@ FEWEST_AT_EDGES = 10
 
 @dataclass(frozen=True)
 class AtEdges:
-    """What the edges say of some shifts, all of them fitted to the edges at once.
+    """Fit of some shifts to the edges, all of them at once.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class AtEdges:
 
 
 def at_edges(problem: InstrumentProblem, space: Space, values: Array, shifts: Sequence[Sequence[Candidate]]) -> AtEdges:
-    """What the edges of all captures say of the shifts of the candidates given, at the values (K,) of a space."""
+    """Fit of the shifts of given candidates to the edges of all captures, at the values (K,) of a space."""
     n = len(shifts)
     curvature, along, square, count, noise = np.zeros((n, n)), np.zeros(n), 0.0, 0, 0.0
     for k in range(len(problem.still)):
@@ -68,7 +68,7 @@ def at_edges(problem: InstrumentProblem, space: Space, values: Array, shifts: Se
 def _of_capture(
     problem: InstrumentProblem, k: int, space: Space, values: Array, *, shifts: Sequence[Sequence[Candidate]]
 ) -> tuple[Array, Array, float] | None:
-    """What each shift (S, P) would leave over at the edges of a capture, what is left (P,), and the square of noise.
+    """Residual (S, P) of each shift at the edges of a capture, the present residual (P,), and the square of noise.
 
     All in units of the noise.
     """

@@ -41,7 +41,7 @@ ELEMENTS = 15
 def mueller_slopes(
     problem: InstrumentProblem, space: Space, values: Array, rms: Array | None = None
 ) -> Iterator[tuple[NDArray[np.int64], Array]]:
-    """Of each capture: the J values that act on it, and products (16, J, J) of the slopes of each element of M/m00.
+    """For each capture: the J values that act on it, and products (16, J, J) of the slopes of each element of M/m00.
 
     A common factor of M is left out. Products are means over the elements, and over the pixels by their brightness.
     `rms` (captures,) is what the intensities of each are known to, in units of noise (default: 1). What they do not
@@ -123,7 +123,7 @@ class MuellerErrors:
 
     @classmethod
     def of(cls, problem: InstrumentProblem, posterior: Posterior, solved: Solution) -> MuellerErrors:
-        """Of a posterior, with slopes where its mean is; `solved` says to what the intensities are known."""
+        """Errors of a posterior, with slopes at its mean; `solved` gives the residual of the intensities."""
         chosen = [k for k, c in enumerate(posterior.space.candidates) if _moves_m(posterior, k, c in solved.effects)]
         space = Space(tuple(posterior.space.candidates[k] for k in chosen))
         index = posterior.space.positions(chosen)
@@ -139,7 +139,7 @@ class MuellerErrors:
         return self.space.vector(used.space.split(used.fit.values))
 
     def changes(self, used: Solution) -> tuple[PredictedChange, PredictedChange, tuple[PredictedChange, ...]]:
-        """What a correction does to M of these captures, of later ones, and of each of these."""
+        """Change of M by a correction: for these captures, for later ones, and for each of these."""
         correction, lasts = self.corrected_values(used), np.flatnonzero(self._of("instrument"))
         products = self.products.sum(axis=0)
         return (
@@ -155,7 +155,7 @@ class MuellerErrors:
         return np.array([c.scope == scope for c in self.space.candidates for _ in c.parameters], dtype=bool)
 
     def uncertain(self, problem: InstrumentProblem, used: Solution) -> tuple[SystematicError, MuellerError] | None:
-        """What stays uncertain of M/m00 about the values that are applied, as a file stores it and as it is told.
+        """Remaining uncertainty of M/m00 about the applied values, as a file stores it and as the answer reports it.
 
         None where nothing does.
         """
@@ -188,7 +188,7 @@ class MuellerErrors:
 
 
 def _residual_rms(problem: InstrumentProblem, solved: Solution) -> Array:
-    """What is left over of each capture (captures,) after the correction, in units of its noise; noise at least."""
+    """Rms residual (captures,) after the correction, in units of the noise of each; at least 1."""
     noise = np.array([m.noise_floor for m in problem.moments])
     rms = np.array([solved.after.of(k).rms for k in range(noise.size)])
     return np.asarray(np.maximum(rms / np.maximum(noise, 1e-300), 1.0))

@@ -45,7 +45,7 @@ def exactly_undone(space: Space, values: Array, *, pointwise: bool = False) -> d
 
 
 def undoing(data: CaptureData, undone: Mapping[Candidate, Array]) -> Correct:
-    """What undoes the effects exactly in signals of a capture, and gives the slope over the old ones."""
+    """Function that undoes the effects exactly in signals of a capture, and returns the slope by the old signals."""
 
     def correct(signal: Array) -> tuple[Array, Array]:
         slope = np.ones(())

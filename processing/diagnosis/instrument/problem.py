@@ -250,7 +250,7 @@ class InstrumentProblem:
 
     @property
     def held_out(self) -> str:
-        """What is predicted by what, in words."""
+        """Description of the held-out data."""
         if self.folds == 1:
             return "nothing: too few values; each fitted value takes a degree of freedom"
         return "; ".join(dict.fromkeys(m.held_out for m in self.moments))

@@ -196,7 +196,7 @@ class Projected:
         return np.asarray(_flat(dc) @ (of_features.sum(axis=0) if dc.shape[1] == 1 else of_features).reshape(-1))
 
     def moved_by_counts(self, dc: Array) -> Array:
-        """What (T, L, R) dc (T or 1, F, L) by one value does to the residual."""
+        """Change (T, L, R) of the residual by dc (T or 1, F, L) of one value."""
         used = np.flatnonzero(np.any(dc, axis=(0, 2)))
         return np.asarray(self.outside @ np.einsum("tfl,tflr->tlr", dc[:, used], self._z[:, used]))
 

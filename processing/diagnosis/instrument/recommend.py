@@ -41,7 +41,7 @@ def recommended(
     *,
     unseen: Sequence[Candidate],
 ) -> str:
-    """What to capture next: for every set that cannot be told apart, else to show what is unseen."""
+    """Next capture: one that separates each indistinguishable set, else one that shows the unseen effects."""
     return " ".join(dict.fromkeys(_capture(problem, space, fit, rivals, unseen=unseen) for rivals in sets or ((),)))
 
 

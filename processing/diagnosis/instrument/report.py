@@ -1,4 +1,4 @@
-"""What the report of a diagnosis shows of each capture of an instrument."""
+"""Figures and facts about each capture in the report of a diagnosis of an instrument."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def _extent(image: NDArray[np.floating]) -> tuple[float, float, float, float]:
 
 
 def _change(judged: Judged, problem: InstrumentProblem, k: int) -> tuple[Sequence[Sequence[str]], str]:
-    """What the correction changes in the Mueller elements, and in xi0."""
+    """Change of the Mueller elements, and of xi0, by the correction."""
     first, second = (_mueller(problem, k, space, fit) for space, fit in judged.solution.ends)
     if first is None or second is None:
         return (), "These states do not determine a Mueller matrix. The report gives no change of final quantities."

@@ -23,7 +23,7 @@ MOMENTS = ("before", "after")
 
 @dataclass(frozen=True)
 class StoredResidual:
-    """What one capture leaves over, before and after the correction.
+    """Residual of one capture, before and after the correction.
 
     Attributes
     ----------

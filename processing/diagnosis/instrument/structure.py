@@ -33,7 +33,7 @@ LEAST_LIGHT = 1e-10
 
 @dataclass(frozen=True)
 class Residual:
-    """What one capture leaves over.
+    """Residual of one capture.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Residual:
 
 @dataclass(frozen=True)
 class Images:
-    """What the tests look at, each (L, rows, columns); NaN or zero where a pixel is not used.
+    """Data of the tests, each (L, rows, columns); NaN or zero where a pixel is not used.
 
     Attributes
     ----------

@@ -45,7 +45,7 @@ def tile_columns(model: InstrumentModel, data: CaptureData, moments: Moments, ch
 
 
 def shares_of_tiles(tiles: Tiles, changes: Changes, frequencies: int) -> Array:
-    """What share (n, tiles) each tile has of the rows at each node, or of what so many frequencies tell of them."""
+    """Share (n, tiles) of each tile in the rows at each node, or in so many frequencies of them."""
     return _shares(extra_retardance(changes, tiles.x, tiles.y), frequencies)
 
 
@@ -58,7 +58,7 @@ def columns_at_nodes(model: InstrumentModel, data: CaptureData, moments: Moments
 
 
 def at_more_nodes(linear: Array, elements: int) -> Array:
-    """What is linear in the rows (..., n, L, K) at the nodes that the quadratic needs, of so many elements."""
+    """Linear function of the rows (..., n, L, K) at the nodes that the quadratic needs, for so many elements."""
     shares = _shares(_nodes(elements, QUADRATIC).T, LINEAR)
     flat = linear.reshape(*linear.shape[:-2], -1)
     return np.asarray(shares.T @ flat).reshape(*linear.shape[:-3], shares.shape[1], *linear.shape[-2:])
@@ -172,7 +172,7 @@ class TileSlopes:
     dc: Array
 
     def of_rows(self, rows: NDArray[np.int64], features: NDArray[np.int64]) -> TileSlopes:
-        """Of some rows and some features alone."""
+        """Slopes of some rows and some features alone."""
         dc = self.dc[:, features][..., rows]
         return replace(self, at_nodes=self.at_nodes[:, :, rows], da=self.da[:, :, rows], dc=dc)
 

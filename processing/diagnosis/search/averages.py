@@ -21,9 +21,9 @@ from processing.diagnosis.search.sets import Conditional, Group, Quadratic, Sets
 
 #: [probability] Weight of a set below which it changes no mean.
 LEAST_WEIGHT = 1e-6
-#: [of its probability] How often a group is asked at least, relative to one that is there half of the time.
+#: [of its probability] Least rate at which a group is tested, relative to a group with probability 1/2.
 LEAST_INTEREST = 0.04
-#: [groups] That are tried in the place of one.
+#: [groups] Alternatives that are tried for one group.
 MOST_RIVALS = 8
 
 
@@ -118,9 +118,9 @@ def chance_of(sets: Sets, c: Conditional) -> Array:
 
 
 def swap_groups(sets: Sets, state: State) -> Iterator[State]:
-    """The set with one of its groups in turn exchanged for one that would do nearly as well in its place.
+    """The set with each of its groups in turn replaced by an alternative that fits nearly as well.
 
-    Of two that say the same the chain may never see the second: it would have to pass a set with both or with none.
+    Of two equivalent groups the chain may never visit the second: its way leads through a set with both or neither.
     """
     for k in np.flatnonzero((state.tau > 0) & sets.free):
         without = sets.without(state, int(k))
@@ -133,7 +133,7 @@ def swap_groups(sets: Sets, state: State) -> Iterator[State]:
 
 
 class ReducedSets:
-    """Sets beside the certain groups of a likely state; their variances and the unit of chi-square stay as they are.
+    """Sets in addition to the certain groups of a likely state, whose variances and unit of chi-square are fixed.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ class ReducedSets:
 
 
 def _worth(sets: Sets, state: State) -> tuple[NDArray[np.bool_], Array]:
-    """Groups (G,) that are certain, and the log odds (G,) of each beside the others or in the place of one."""
+    """Groups (G,) that are certain, and the log odds (G,) of each in addition to the others or instead of one."""
     is_included = state.tau > 0
     certain = is_included & ~sets.free
     reach = sets.conditional(state).log_odds
@@ -222,7 +222,7 @@ class _ByStay:
         self.best: tuple[float, State] | None = None
 
     def conditional(self, state: State) -> tuple[Conditional, Array]:
-        """What a state says of every group given the others, and the probability (G,) of each."""
+        """Conditional posterior of every group given the others, and the probability (G,) of each."""
         key = state.tau.tobytes()
         if key not in self._known:
             c = self._sets.conditional(state)
@@ -283,10 +283,10 @@ def stay(sets: Sets, state: State, changes: int, seed: int = 0) -> Samples:
 
 
 def _starts(sets: Sets, state: State) -> list[tuple[State, float]]:
-    """States to start from, and what share of the changes each has: the likely one, and those that are as likely.
+    """Start states, each with its share of the changes: the likely one, and those that are equally likely.
 
-    Of two groups that say the same the chain may never see the second: it would have to pass a set with both or with
-    none. One that does what several do would need them all to go at once.
+    Of two equivalent groups the chain may never visit the second: its way leads through a set with both or neither.
+    A group that replaces several would need all of them to leave at once.
     """
     indices = np.flatnonzero((state.tau > 0) & sets.free)
     instead = (climb(sets, sets.without(state, int(k)), without=int(k)) for k in indices)

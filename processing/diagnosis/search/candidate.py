@@ -90,7 +90,7 @@ class Candidate:
         return f"{self.kind}:{where}:{self.capture}"
 
     def at(self, wavelength_nm: float) -> Candidate:
-        """What it is at one wavelength: the same, unless its values are a curve over the wavelengths."""
+        """The candidate at one wavelength: the same, unless its values are a curve over the wavelengths."""
         if self.curve is None:
             return self
         return replace(self, parameters=self.curve.parameters, wavelength_nm=wavelength_nm, curve=None)
@@ -257,7 +257,7 @@ def pool(
 ) -> tuple[Candidate, ...]:
     """Every effect of the instrument at every place of the captures, by default all at one wavelength.
 
-    What shifts a value that is fitted as nominal is left out: the same number under two names would be a false pair of
+    Effects that shift a fitted nominal value are excluded: the same number with two names would be a false pair of
     indistinguishable effects.
     """
     wavelengths_nm = wavelengths_nm or (0.0,) * len(conditions)
@@ -294,7 +294,7 @@ def _over_wavelengths(candidate: Candidate, belongs: Belongs, wavelengths_nm: Se
 
 
 def _check_declared(model: InstrumentModel) -> None:
-    """What `belongs_to` declares has to exist."""
+    """Check that the effects in `belongs_to` exist."""
     unknown = [name for name in model.belongs_to if name not in instrument_effects() and name not in model.calibrate]
     if unknown:
         raise ProcessError(

@@ -1,7 +1,7 @@
-"""Names: which group is a cause, how probable, what could stand in its place, and what would have been seen.
+"""Names: the groups that are causes, their probabilities, their alternatives, and the observable effects.
 
-A correction is what improves predictions, a name is a cause. Groups whose signatures, seen through everything else,
-point the same way are one class: that one of them is there can be certain while which one is not.
+A correction improves predictions, a name states a cause. Groups with parallel signatures, after projection of all
+other effects, are one class. It can be certain that one of them is present, and open which one.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Cause:
 
     @property
     def answer(self) -> Answer:
-        """How it is told."""
+        """Word for the cause in the answer."""
         if self.probability < LIKELY:
             return "unknown"
         if self.alternatives:
@@ -66,16 +66,16 @@ def causes(posterior: Posterior, chi2: float) -> tuple[Cause, ...]:
     state, (values, covariance) = posterior.samples.best, posterior.of_likeliest()
     result = []
     for k in posterior.free_groups:
-        # Of every group to be there in the place of this one, its own among them.
+        # Odds of every group as the replacement of this one, its own included.
         odds = posterior.sets.conditional(posterior.sets.without(state, k)).log_odds
         least = least_odds(odds[k], chi2 / state.unit)
         rivals = posterior.sets.free & (state.tau == 0) & (odds > least)
         alternatives = [int(j) for j in np.argsort(-odds) if rivals[j]]
         alternatives += [j for j in posterior.rivals.get(k, ()) if j not in alternatives]
         parts = [posterior.space.slices[m] for m in posterior.members[k]]
-        # From which state on it acts may be open where that it does is certain.
+        # The effect can be certain while the state from which it acts is open.
         members = list(dict.fromkeys([k, *alternatives, *_of_family(posterior, k)]))
-        # The sets that were visited, and the odds beside the likeliest, each err on the sure side.
+        # The visited sets, and the odds given the likeliest set, are both too confident.
         total = float(np.logaddexp.reduce(odds[members]))
         result.append(
             Cause(
@@ -97,7 +97,7 @@ def shown(values: Array, covariance: Array) -> float:
 
 
 def least_odds(odds: float, chi2: float) -> float:
-    """Log odds from which on another group in a cause's place is named with it.
+    """Log odds above which an alternative group is named together with a cause.
 
     `chi2` is that which no cause explains, in its unit.
     """
@@ -105,7 +105,7 @@ def least_odds(odds: float, chi2: float) -> float:
 
 
 def _of_family(posterior: Posterior, k: int) -> list[int]:
-    """The same effect from one state on, or another."""
+    """Groups of the same effect, from one state on or another."""
     return [j for j in range(len(posterior.members)) if posterior.label(j).family == posterior.label(k).family]
 
 
@@ -122,7 +122,7 @@ def information(posterior: Posterior) -> tuple[Array, NDArray[np.int64]]:
 
 
 def observable_effects(posterior: Posterior) -> tuple[Candidate, ...]:
-    """Effects of optics, source or surface that at a typical size would stand out of the noise, or of what is left."""
+    """Effects of optics, source or surface that exceed the noise, or the residual, at a typical size."""
     precision, always = information(posterior)
     precision /= posterior.samples.best.unit
     return tuple(
@@ -136,7 +136,7 @@ def observable_effects(posterior: Posterior) -> tuple[Candidate, ...]:
 
 
 def wanted_for_evidence(problem: Problem) -> str:
-    """What would make a statement possible where nothing of typical size would have been seen."""
+    """Advice where no effect of typical size is observable."""
     needed = "More light, more pixels, or states that differ more."
     if problem.noise_known:
         return needed

@@ -1,4 +1,4 @@
-"""The correction of a posterior: its mean, of what is likely enough to take part, and what that predicts."""
+"""The correction of a posterior: the mean of the groups that are likely enough, and its predictions."""
 
 from collections.abc import Collection
 
@@ -15,7 +15,7 @@ from processing.diagnosis.search.space import Problem, Space
 
 
 def applied(posterior: Posterior, base: Space, unfit: Collection[Candidate] = ()) -> tuple[Space, Array]:
-    """Space and values of the correction: the mean of the posterior, of what is likely enough to take part."""
+    """Space and values of the correction: the posterior mean of the groups that are likely enough."""
     keep = set(base.candidates)
     by_label = {posterior.label(g): g for g in range(len(posterior.members))}
     for cause in causes(posterior, 0.0):
@@ -32,10 +32,10 @@ def applied(posterior: Posterior, base: Space, unfit: Collection[Candidate] = ()
 
 
 def _least_needed(posterior: Posterior, keep: Collection[Candidate]) -> list[int]:
-    """Groups beside those to `keep` that are likely enough to take part, and as many more as the fit would miss.
+    """Groups in addition to `keep` that are likely enough, and further groups without which the fit gets worse.
 
-    Several that are unlikely one by one can be one cause together: the mean has a part of each, which are nothing
-    without each other.
+    Several groups that are unlikely one by one can be one cause together: the mean has a part of each, and these parts
+    fit only together.
     """
     space, form = posterior.space, posterior.sets.form
     order = np.argsort(-posterior.samples.probability)
@@ -56,7 +56,7 @@ def _least_needed(posterior: Posterior, keep: Collection[Candidate]) -> list[int
 def solution(
     problem: Problem, posterior: Posterior, base: Space, start: Array, *, unfit: Collection[Candidate] = ()
 ) -> Solution:
-    """The correction of a posterior, without what is `unfit`, and how well it predicts what it did not see.
+    """The correction of a posterior, without the `unfit` candidates, and how well it predicts held-out data.
 
     `base` is always fitted, from `start` (K,) on.
     """

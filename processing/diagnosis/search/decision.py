@@ -54,7 +54,7 @@ def _rank_and_condition(w: Array) -> tuple[int, float]:
 
 @dataclass(frozen=True)
 class PredictedChange:
-    """What a correction does to what the user reads (M/m00, xi0), as the posterior expects it; all rms over pixels.
+    """Change of the result (M/m00, xi0) by a correction, as the posterior expects it; all rms over pixels.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class PredictedChange:
 
 
 def predicted_change(correction: Array, mean: Array, covariance: Array, products: Array) -> PredictedChange:
-    """Of a `correction` (K,), where the true ones have a mean (K,) and a covariance (K, K).
+    """Change by a `correction` (K,), where the true values have a mean (K,) and a covariance (K, K).
 
     `products` (K, K) of the slopes of what the user reads, averaged.
     """
@@ -117,12 +117,12 @@ def refusal(figures: tuple[Check, ...]) -> str | None:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What speaks for an answer, and against it.
+    """Evidence for an answer, and against it.
 
     Attributes
     ----------
-    named, sure : whether a cause is there, and whether nothing speaks against the name of one.
-    structure : whether tests see something in what is left.
+    named, sure : whether a cause is present, and whether the name of one is without doubt.
+    structure : whether tests find structure in the residual.
     observable : whether a fault of typical size would have been seen.
     figures : of the residual and of W, before and after; chances : that what the user reads gets worse.
     first : what has to be changed before anything else means something.
@@ -138,7 +138,7 @@ class Judgement:
 
     @property
     def verdict(self) -> Verdict:
-        """Of names and structure; a correction by which the residual or W gets worse explains nothing."""
+        """Verdict from names and structure; a correction that increases the residual or spoils W explains nothing."""
         if self.first is not None or (self.named and refusal(self.figures) is not None):
             return "unexplained"
         if self.structure:
@@ -158,7 +158,7 @@ class Judgement:
         return refusal(self.checks) if self.first is None else f"change this first: {self.first}"
 
     def applied(self, solved: Solution, any_cause: bool) -> Solution:
-        """What is applied: a solution that holds, if there is anything in it; else nothing."""
+        """The applied correction: a solution that holds and is not empty; else none."""
         holds = self.refused is None and (any_cause or any(c.place for c in solved.base.candidates))
         return solved if holds else solved.undone
 

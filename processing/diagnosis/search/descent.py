@@ -63,7 +63,7 @@ def next_values(problem: Problem, space: Space, sets: Sets, state: State, *, x: 
 
 
 def mean_over_sets(space: Space, samples: Samples, x: Array) -> Array:
-    """Values (K,), mean over the sets; of what is not fitted those of x (K,)."""
+    """Values (K,), mean over the sets; values that are not fitted are those of x (K,)."""
     typical, lower, upper = (space.joined(name) for name in ("typical", "lower", "upper"))
     return np.where(space.fixed, x, np.clip(samples.mean * typical, lower, upper))
 

@@ -36,7 +36,7 @@ class Curve:
 
     @property
     def coefficients(self) -> tuple[Parameter, ...]:
-        """What is fitted, one parameter for each coefficient."""
+        """Fitted parameters, one for each coefficient."""
         return tuple(
             Parameter(f"{p.name}_curve_{t}", p.unit, p.lower, p.upper, p.typical)
             for p in self.parameters

@@ -24,7 +24,7 @@ EXPANSIONS = 2
 LEAST_GAIN = 0.05
 #: [of the chi-square] The same.
 LEAST_RELATIVE = 1e-7
-#: [of the excess] To which what is held out is predicted: a fit that ends earlier would still know it.
+#: [of the excess] Precision of held-out predictions: a fit that ends earlier would still contain the held-out data.
 HELD_OUT_RELATIVE = 1e-4
 #: [1] By which a step that is refused is damped more, and one that is taken less.
 STIFFER = 10.0
@@ -135,7 +135,7 @@ def _penalize(sums: Sums, weak: Array, values: Array, use: Sequence[int], *, ref
 
 
 def score(sums: Sums, active: int, new: slice, weak: Array) -> tuple[float, Array]:
-    """What one Gauss-Newton step of some parameters promises, the first `active` ones refitted with them.
+    """Expected gain of one Gauss-Newton step of some parameters, with the first `active` ones refitted.
 
     Returns
     -------
@@ -172,7 +172,7 @@ class HeldOut:
         return HeldOut(excess, max(freedom, 1e-300), square, max(count, 1e-300))
 
     def and_more(self, excess: float, square: float) -> HeldOut:
-        """The same with more left over, in units of the noise and of the signal."""
+        """The same with a larger residual, in units of the noise and of the signal."""
         # Fits to other folds may end elsewhere than the fit to all, whose difference this is.
         return HeldOut(self.excess + excess, self.freedom, max(self.square + square, 0.0), self.count)
 
@@ -230,7 +230,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
 
 
 def _count_determined(curvature: Array, weak: Array, local: BoolArray) -> Array:
-    """What share of each local value the data determine, against the prior and the other local values; 0 elsewhere."""
+    """Share of each local value that the data determine, against the prior and other local values; 0 elsewhere."""
     h = curvature[np.ix_(local, local)]
     shares = np.zeros(local.size)
     shares[local] = np.diag(np.linalg.lstsq(h + np.diag(weak[local]), h, rcond=None)[0])

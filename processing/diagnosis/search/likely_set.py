@@ -13,12 +13,12 @@ PATIENCE = 8
 
 #: [changes] Of a set in one climb.
 STEPS = 60
-#: [1] One in so many of the groups that nothing speaks for are taken away at once.
+#: [1] One in so many of the groups without evidence is removed at once.
 AT_ONCE = 6
 
 
 def likely_set(sets: Sets, initial: BoolArray | None = None) -> State:
-    """The likeliest of some: several causes together can be plain where each alone is nothing, and the reverse.
+    """The likeliest of several searches: causes can be evident together and not alone, and the reverse.
 
     One search starts from the groups `initial` (G,), in the unit of noise: in that of structure a prior is too stiff
     for a cause that explains it.
@@ -61,7 +61,7 @@ def everything(sets: Sets) -> State:
 
 
 def thin_out(sets: Sets) -> State:
-    """From everything, the least needed taken away until all are needed; the likeliest of these."""
+    """Start from all groups and remove the least needed until all are needed; return the likeliest set."""
     state = sets.settled(everything(sets))
     best, best_state = -np.inf, state.copy()
     while True:

@@ -1,4 +1,4 @@
-"""The chi-square of a problem as a quadratic form in all candidates, their groups, and the unit that it is told in."""
+"""The chi-square of a problem as a quadratic form in all candidates, their groups, and its unit."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def group_candidates(space: Space, fixed: Sequence[Candidate]) -> tuple[tuple[tu
 
 
 def noise_of(problem: Problem, sums: Sums) -> Noise:
-    """What the unit of chi-square is made of in a problem."""
+    """Noise model of a problem: how its unit of chi-square follows."""
     freedom = max(float(sums.freedom.sum()), 1.0)
     if not problem.noise_known:
         # The unit is then the square of what `freedom` was reckoned with, relative to the signal.

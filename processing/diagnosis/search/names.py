@@ -1,4 +1,4 @@
-"""Names of causes, and why what is left over puts some of them in doubt."""
+"""Names of causes, and doubts about them because of the residual."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ PARTS = (PART_OF_LEFT, PART_OF_UNLISTED)
 
 @dataclass(frozen=True)
 class Names:
-    """Causes that are told.
+    """Causes that the answer reports.
 
     Attributes
     ----------
     named : likely ones; doubt : why some of them have no sure name.
-    untold : as many values as the data have, which have no name at all.
+    untold : causes with as many values as the data have; they get no name.
     """
 
     named: tuple[Cause, ...]
@@ -31,19 +31,19 @@ class Names:
 
     @property
     def sure(self) -> list[Cause]:
-        """Those that nothing speaks against."""
+        """Causes without a doubt."""
         return [c for c in self.named if c.answer != "unknown" and c not in self.doubt]
 
     @property
     def rivals(self) -> list[tuple[Candidate, ...]]:
-        """Sets of effects of which one is there."""
+        """Sets of effects of which one is present."""
         return [(c.candidates[0], *c.other_effects) for c in self.named if c.other_effects]
 
 
 def with_parts(
     posterior: Posterior, causes: Sequence[Cause], doubt: Mapping[Cause, str], *, chi2: float, noise_known: bool
 ) -> dict[Cause, str]:
-    """Reasons of doubt by cause, with those of being a part of something else.
+    """Reasons of doubt by cause, with the causes that may be part of another mechanism.
 
     `chi2` is that of structure.
     """
@@ -75,8 +75,8 @@ def at_bound(cause: Cause) -> bool:
 
 
 def answer_of(cause: Cause, doubt: str | None) -> tuple[Answer, float]:
-    """The word for a cause and its probability: what may be a part of something else is not sure, what is doubted for
-    another reason is not told."""
+    """The word for a cause and its probability: one that may be part of another mechanism is at most likely, one
+    with another doubt is unknown."""
     if doubt is None:
         return cause.answer, cause.probability
     probability = min(cause.probability, LIKELY)

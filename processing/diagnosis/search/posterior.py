@@ -1,4 +1,4 @@
-"""The posterior of all effects at once: linearize, find which groups are there, improve the solution, again.
+"""The posterior of all effects at once: linearize, select groups, improve the solution, and repeat.
 
 Every effect at every place takes part from the beginning, so no order of adding matters. Values of one kind in several
 captures are one group; a slip is one of as many rivals as there are states.
@@ -40,7 +40,7 @@ from processing.diagnosis.search.rules import (
 from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Problem, Space
 
-#: Called with a line that says what is being done.
+#: Called with a line about the present step.
 Say = Callable[[str], None]
 
 
@@ -52,7 +52,7 @@ class Posterior:
     ----------
     space : all candidates; members : numbers of the candidates of each group.
     sets, samples : the last linearization, and the sets that were visited in it.
-    rivals : by a group that is there, those that do as well in its place where each is linearized about its own values.
+    rivals : for each present group, alternatives that fit equally well when each is linearized about its own values.
     values : (K,) mean; covariance : (K, K), both in the units of the parameters.
     """
 
@@ -165,7 +165,7 @@ def _expand(
     problem.relinearize(space, last.about)
     down = problem.noise_known and last.state.unit <= BENT
     bends = [g for g, indices in enumerate(members) if space.candidates[indices[0]].is_pointwise]
-    # Structure is described by whatever comes nearest to it: what is found beside it is not compared so closely.
+    # With structure the nearest effects describe it, so their alternatives are not compared so closely.
     last, rivals = _of_bends(problem, space, last, bends if down else (), look=look)
     return last.about, last.sets, last.state, rivals
 
@@ -173,10 +173,10 @@ def _expand(
 def _of_bends(
     problem: Problem, space: Space, first: _Round, bends: Sequence[int], *, look: Look
 ) -> tuple[_Round, dict[int, tuple[int, ...]]]:
-    """The likeliest, of this and of those with another of the `bends` (groups) in the place of one that is there.
+    """The likeliest of this round and of rounds in which one of the `bends` (groups) replaces a present one.
 
-    Corrections of counts are expanded about what was found, where the right one may look worse than a wrong one. Also
-    which others do as well as each that is there, about their own values.
+    Corrections of counts are expanded about the current values, where the right one may look worse than a wrong one.
+    Also returns the alternatives that fit equally well about their own values.
     """
     rounds = [first]
     for k in (g for g in bends if first.state.tau[g] > 0):
@@ -191,16 +191,16 @@ def _of_bends(
     def groups_in(trial: _Round) -> set[int]:
         return {g for g in bends if trial.state.tau[g] > 0}
 
-    # The noise is that of the light which the first of them tells: it is preferred by more than its evidence.
+    # The noise was computed with the first of them, which is therefore preferred by more than its evidence.
     best_groups, likely = groups_in(best), [groups_in(trial) for trial in rounds if trial.score > best.score - CERTAIN]
     return best, {k: tuple(sorted({j for on in likely if k not in on for j in on - best_groups})) for k in best_groups}
 
 
 def _settle(problem: Problem, space: Space, first: _Round, look: Look, *, rounds: int) -> _Round:
-    """Linearized anew about what was found, at most so many times, until it stays.
+    """Linearize again about the new values, at most so many times, until they converge.
 
-    Values that the data hardly tell can move on and on beside each other, to where the problem is another one. So it
-    ends before a round that is less likely than one that the counts bear out.
+    Poorly determined values can drift together, out of the range of the linearization. So the iteration stops when the
+    evidence falls below that of an earlier, verified round.
     """
     now, score = first, -np.inf
     for _ in range(rounds - 1):

@@ -29,9 +29,9 @@ def probability_at(log_odds: Array | float) -> Array:
     return np.asarray(1 / (1 + np.exp(-np.clip(log_odds, -MOST_ODDS, MOST_ODDS))))
 
 
-#: [probability] Of what cannot be, for its logarithm.
+#: [probability] Of an impossible variance, for its logarithm.
 LEAST_WEIGHT = 1e-300
-#: [log odds] Of what cannot be, beyond what any data speak for.
+#: [log odds] Of an impossible set, below the evidence of any data.
 NEVER = -1e9
 #: [groups] That are not there, at least, in the odds of one more.
 FEWEST_ABSENT = 0.1
@@ -71,16 +71,16 @@ class Group:
 
 @dataclass(frozen=True)
 class Noise:
-    """What the unit of chi-square is: noise, and structure that no set explains.
+    """Noise model of the chi-square: its unit is noise, and structure that no set explains.
 
-    Structure that is left is the same in all pixels: a noise of a few directions. It widens every error, so that a
-    million pixels do not shout it down.
+    Residual structure is the same in all pixels: a noise of a few directions. It widens every error for any number of
+    pixels.
 
     Attributes
     ----------
-    is_known : the noise is known, so the unit is at least one; else all that is left is noise.
+    is_known : the noise is known, so the unit is at least one; else the whole residual is noise.
     directions : independent directions over which structure spreads; of unknown noise, the degrees of freedom.
-    slack : excess up to which nothing but noise is left.
+    slack : excess up to which the residual is noise.
     floor : least unit.
     """
 
@@ -141,7 +141,7 @@ class SetFit:
 
 @dataclass(frozen=True)
 class Conditional(SetFit):
-    """The same, with what it says of every group given the others: log odds (G,), and weights (G, T) of each tau."""
+    """The same, with the conditional posterior of every group: log odds (G,), and weights (G, T) of each tau."""
 
     log_odds: Array
     tau_weights: Array
@@ -150,8 +150,8 @@ class Conditional(SetFit):
 class Sets:
     """Sets of groups in one quadratic problem.
 
-    `count` is the number of groups that might be there, if these are not all of them; `beside` is how many are there
-    besides them.
+    `count` is the number of groups that might be there, if these are not all of them; `beside` is how many others are
+    present.
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class Sets:
         # The alternatives of one group count once.
         self.count = float(np.sum(np.exp(-self.price[self.free]) / self.share[self.free])) if count is None else count
         self.taus = TAU
-        # Where what is left is the noise, what fits better would be taken for a smaller one.
+        # With unknown noise a better fit would count as smaller noise.
         self.many = np.array([g.index.size >= MANY and noise.is_known for g in groups], dtype=bool)
         self.tau_weight = np.where(self.many[:, None], TAU_WEIGHT_OF_MANY, TAU_WEIGHT)
         sizes = np.array([g.index.size for g in groups])
@@ -178,11 +178,11 @@ class Sets:
                 self._alike.append((members, index, form.curvature[index[:, :, None], index[:, None, :]]))
 
     def empty(self) -> State:
-        """The set of what is always there."""
+        """The set of the groups that are always present."""
         return self.settled(State(np.array([g.fixed_tau or 0.0 for g in self.groups])))
 
     def settled(self, state: State) -> State:
-        """The state with the unit that goes with what it leaves."""
+        """The state with the unit of its residual."""
         for _ in range(4):
             before, state.unit = state.unit, self.noise.unit(self._excess(state))
             if state.unit == before:
@@ -307,7 +307,7 @@ def _along_axes(s: Array, q: Array) -> tuple[Array, Array]:
 
 
 def _root(matrix: Array) -> Array:
-    """Cholesky factor; where rounding has made the matrix indefinite, beside far steeper directions, of what it was."""
+    """Cholesky factor; of the nearest positive matrix if rounding has made it indefinite next to steep directions."""
     try:
         return np.asarray(np.linalg.cholesky(matrix))
     except np.linalg.LinAlgError:

@@ -64,7 +64,7 @@ class Sums:
 
 @dataclass(frozen=True)
 class Acting:
-    """What of a common vector acts on one capture.
+    """Part of a common vector that acts on one capture.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class Space:
         return np.array([c.effect.is_switch for c in self.candidates for _ in c.parameters], dtype=bool)
 
     def acting(self, capture: int, wavelength_nm: float) -> Acting:
-        """What acts on a capture, and where its values stand in the common vector."""
+        """Candidates that act on a capture, and the positions of their values in the common vector."""
         if (capture, wavelength_nm) not in self._acting:
             self._acting[capture, wavelength_nm] = self._of_capture(capture, wavelength_nm)
         return self._acting[capture, wavelength_nm]
@@ -157,7 +157,7 @@ class Space:
 
 
 class Problem(Protocol):
-    """What the search needs of measured data and a model.
+    """Interface of the search to measured data and a model.
 
     Attributes
     ----------
@@ -188,7 +188,7 @@ class Problem(Protocol):
         ...
 
     def noise_information(self, space: Space, values: Array) -> Array:
-        """Part (K, K) of the curvature that is noise of image derivatives and tells nothing about the values."""
+        """Part (K, K) of the curvature that is noise of image derivatives and has no information about the values."""
         ...
 
     def time_noise(self, space: Space, values: Array) -> Array:

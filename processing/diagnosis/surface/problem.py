@@ -65,7 +65,7 @@ class SurfacePixels:
     extra: Array
 
     def outside(self, v: Array) -> Array:
-        """What the two coefficients cannot take up of v (P, L)."""
+        """Projection of v (P, L) outside the two coefficients."""
         projected = v - self.e * np.sum(self.e * v, axis=1, keepdims=True)
         along = np.sum(self.f * projected, axis=1) * (1 - np.sqrt(self.hold))
         return np.asarray(projected - self.f * along[:, None])

@@ -20,7 +20,7 @@ SHOWS_XI0 = 20.0
 
 
 class SurfaceQuantities(Section):
-    """What the model says, one capture.
+    """Quantities of one capture by the model.
 
     `psi_deg` and `magnitude_percent` are root mean square differences between the modelled and the measured dominant
     process (a full Mueller capture only), the `noise` ones what they would be if the model were right: its intensities
@@ -36,7 +36,7 @@ class SurfaceQuantities(Section):
 
 
 def quantities(problem: SurfaceProblem, k: int, space: Space, values: Array) -> tuple[SurfaceQuantities, Array]:
-    """What the model with these values says of a capture, and xi0 of its pixels (P,)."""
+    """Quantities of a capture by the model with these values, and xi0 of its pixels (P,)."""
     pixels, data = problem.pixels(k, space, values), problem.captures[k]
     xi0 = _xi0(pixels)
     good = xi0[np.isfinite(xi0)]
@@ -83,7 +83,7 @@ def dominant_errors(
 
 
 def chances(problem: SurfaceProblem, solved: Solution, covariance: Array) -> tuple[Check, ...]:
-    """What the correction does to xi0, where its values have a covariance (K, K); none where no pixel shows xi0."""
+    """Change of xi0 by the correction, whose values have a covariance (K, K); none where no pixel shows xi0."""
     if not solved.effects:
         return ()
     change = change_of_xi0(problem, solved, covariance)

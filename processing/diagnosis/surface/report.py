@@ -1,4 +1,4 @@
-"""What the report of `diagnose --reflectance` shows of each capture."""
+"""Figures and facts about each capture in the report of `diagnose --reflectance`."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ class SurfaceView:
 
 
 def _once(cache: dict[tuple[object, ...], Kept], key: tuple[object, ...], make: Callable[[], Kept]) -> Kept:
-    """What is kept of a key, made where it is not there yet."""
+    """The cached value of a key; computed if it is not cached yet."""
     if key not in cache:
         if len(cache) >= KEPT:
             cache.clear()

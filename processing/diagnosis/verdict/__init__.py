@@ -1,1 +1,1 @@
-"""What a diagnosis says, of an instrument and of a surface alike: result, checks, report."""
+"""Answer of a diagnosis, for an instrument and a surface alike: result, checks, report."""

@@ -38,7 +38,7 @@ OPEN = 5.0
 
 
 class CaptureInfo(Protocol):
-    """What is told of every capture."""
+    """Properties of every capture in an answer."""
 
     @property
     def name(self) -> str: ...
@@ -104,7 +104,7 @@ def ties(values: Array, covariance: Array, typical: Array) -> Iterator[Tie]:
 
 
 def combinations(posterior: Posterior, solved: Solution) -> tuple[Combination, ...]:
-    """Of the values of a correction, those that are only known together."""
+    """Combinations of the values of a correction that are only known together."""
     effects = set(solved.effects)
     at: list[int] = []
     names: list[str] = []
@@ -156,7 +156,7 @@ def stretch(problem: DiagnosisProblem, solved: Solution, k: int | None = None) -
 
 
 def held_out_without(problem: DiagnosisProblem, solved: Solution, effects: Collection[Candidate]) -> HeldOut:
-    """What the correction would leave without some of its effects; for each degree of freedom, as after it."""
+    """Residual of the correction without some of its effects; for each degree of freedom, as after it."""
     values = solved.fit.values.copy()
     for candidate, part in solved.space.pairs:
         if candidate in effects:
@@ -169,7 +169,7 @@ def held_out_without(problem: DiagnosisProblem, solved: Solution, effects: Colle
 def effects_of_cause(
     problem: DiagnosisProblem, solved: Solution, cause: Cause, doubt: str | None, *, not_applied: str | None
 ) -> list[FoundEffect]:
-    """A cause as it is told, given a reason to doubt it; one for each capture in which it shows."""
+    """Effects of a cause for the answer, given a reason to doubt it; one for each capture in which it shows."""
     without = held_out_without(problem, solved, (*cause.candidates, *cause.alternatives))
     if not any(c in solved.space.candidates for c in (*cause.candidates, *cause.alternatives)):
         not_applied = not_applied or doubt or "it is not needed in addition to the other causes"
@@ -208,7 +208,7 @@ def effects_of_cause(
 
 
 def effects_of_switches(problem: DiagnosisProblem, solved: Solution) -> list[FoundEffect]:
-    """Pixels that are left out because what they say is another thing than the others say."""
+    """Effects that exclude pixels, because these contradict the others."""
     effects = []
     for candidate, part in solved.space.pairs:
         if candidate.effect.is_switch:
@@ -364,7 +364,7 @@ class Answer:
         }
 
     def _correction(self, lasts: bool, uncertain: tuple[SystematicError, MuellerError] | None) -> Correction:
-        """What a file would hold: means, with the spread over the sets; for these captures alone unless it `lasts`."""
+        """Content of a file: means, with the spread over the sets; for these captures alone unless it `lasts`."""
         posterior, solved, captures = self.posterior, self.solved, self.problem.captures
         part, candidates = dict(posterior.space.pairs), posterior.space.candidates
         chance = {candidates[m]: p for g, p in enumerate(posterior.samples.probability) for m in posterior.members[g]}

@@ -12,7 +12,7 @@ from processing.whole_file import write_new_text
 
 @dataclass(frozen=True)
 class CaptureSection:
-    """What the report shows of one capture.
+    """Content of the report about one capture.
 
     `facts` are names and values; `elements` is a table of what the correction changes in M, and `note` a sentence.
     """
