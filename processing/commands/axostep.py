@@ -6,9 +6,7 @@ from typing import Annotated
 import typer
 
 from processing.commands.batch import Output, files_of, place_for, run_batch, written_if_changed
-from processing.commands.command_line import command
-from processing.commands.product_options import Overwrite, ProductFile
-from processing.commands.purposes import DATA, EXPORT
+from processing.commands.command_line import DATA, EXPORT, Overwrite, ProductFile, command
 
 
 @command("from-axostep", DATA)

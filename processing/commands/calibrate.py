@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from processing.commands.command_line import command
-from processing.commands.product_options import Overwrite, ProductFile
-from processing.commands.purposes import CALIBRATION
+from processing.commands.command_line import CALIBRATION, Overwrite, ProductFile, command
 
 if TYPE_CHECKING:
     from processing.calibration.train import CurveFit, FittedValues

@@ -5,10 +5,8 @@ from typing import Annotated
 
 import typer
 
-from processing.commands.command_line import command
+from processing.commands.command_line import CALIBRATION, Overwrite, command
 from processing.commands.drawing import FigureFile, NoFigure, draw
-from processing.commands.product_options import Overwrite
-from processing.commands.purposes import CALIBRATION
 
 
 @command("camera", CALIBRATION)

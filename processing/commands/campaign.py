@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from processing.commands.batch import reason_of
-from processing.commands.command_line import command
-from processing.commands.purposes import REPORTS
+from processing.commands.command_line import REPORTS, command
 from processing.whole_file import whole_file
 
 if TYPE_CHECKING:

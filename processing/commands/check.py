@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from processing.commands.batch import Output, files_of, run_batch
-from processing.commands.command_line import command
-from processing.commands.purposes import CALIBRATION
+from processing.commands.command_line import CALIBRATION, command
 
 if TYPE_CHECKING:
     from processing.campaign.drift import Change

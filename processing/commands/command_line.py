@@ -7,17 +7,31 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from importlib.metadata import version
+from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
 
 import typer
 from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
-from processing.commands.purposes import FIRST, PURPOSES
 from processing.doors import CONTROL
 from processing.errors import ProcessError
 
 INTERRUPTED = 130
+# Headings of `process --help`: purposes of its commands, in the order of the work.
+DATA = "Bring data in"
+IMAGES = "Images and quantities"
+CALIBRATION = "Calibrate and design"
+REFLECTANCE = "Reflectance"
+REPORTS = "Campaigns and reports"
+EXPORT = "Write for other programs"
+#: Commands that come first in their list, as they are used; the others follow by name.
+FIRST = ("init", "import", "reduce", "quantities", "mean", "check", "calibrate", "fit-material", "campaign", "export")
+#: In this order.
+PURPOSES = (DATA, IMAGES, CALIBRATION, REFLECTANCE, REPORTS, EXPORT)
+#: Options of the commands that write a product.
+ProductFile = Annotated[Path | None, typer.Option("--out", help="Product file; default: beside the input.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")]
 # Two things that everybody would wait for. None of pydantic's plug-ins is used: looking for them reads the metadata of
 # all packages. Before it ends, the interpreter would look for cycles in all that the libraries keep.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
@@ -47,7 +61,7 @@ F = TypeVar("F", bound=Callable[..., None])
 
 
 def command(name: str, purpose: str) -> Callable[[F], F]:
-    """Make a command of `process` of a function, under a heading of its help (`processing.commands.purposes`)."""
+    """Make a command of `process` of a function, under a heading of its help."""
 
     def keep(function: F) -> F:
         COLLECTED.append((name, purpose, function))

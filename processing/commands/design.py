@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from processing.commands.command_line import command
-from processing.commands.purposes import CALIBRATION
+from processing.commands.command_line import CALIBRATION, command
 from processing.whole_file import write_new_text
 
 if TYPE_CHECKING:

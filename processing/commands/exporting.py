@@ -6,8 +6,7 @@ from typing import Annotated
 import typer
 
 from processing.commands.batch import Output, files_of, place_for, run_batch, written_if_changed
-from processing.commands.command_line import command
-from processing.commands.purposes import EXPORT
+from processing.commands.command_line import EXPORT, command
 
 
 @command("export", EXPORT)

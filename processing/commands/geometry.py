@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from processing.commands.command_line import command
-from processing.commands.purposes import CALIBRATION
+from processing.commands.command_line import CALIBRATION, command
 from processing.whole_file import write_whole_text
 
 

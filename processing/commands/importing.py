@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from processing.commands.batch import Output, files_of, place_for, run_batch
-from processing.commands.command_line import command
-from processing.commands.purposes import DATA
+from processing.commands.command_line import DATA, command
 from processing.commands.recipe import read_recipe, recipe_text
 from processing.errors import ProcessError
 from processing.whole_file import write_whole_text

@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from processing.commands.command_line import command
-from processing.commands.purposes import DATA
+from processing.commands.command_line import DATA, command
 
 _GENERATORS = {
     "none": "unpolarized light, or the sample is the source",

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from processing.commands.batch import captures_and, files_of
-from processing.commands.command_line import command
-from processing.commands.purposes import IMAGES
+from processing.commands.command_line import IMAGES, command
 
 if TYPE_CHECKING:
     from processing.maps.means import MeanValue

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from processing.commands.batch import files_of, make_products
-from processing.commands.command_line import command
+from processing.commands.command_line import IMAGES, Overwrite, ProductFile, command
 from processing.commands.drawing import FigureFile, NoFigure
-from processing.commands.product_options import Overwrite, ProductFile
-from processing.commands.purposes import IMAGES
 
 if TYPE_CHECKING:
     from processing.steps.file_step import FileStep, Progress

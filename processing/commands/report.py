@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from processing.commands.command_line import command
-from processing.commands.purposes import REPORTS
+from processing.commands.command_line import REPORTS, command
 
 
 @command("report", REPORTS)

@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from processing.commands.command_line import command
-from processing.commands.purposes import DATA, EXPORT, REFLECTANCE
+from processing.commands.command_line import DATA, EXPORT, REFLECTANCE, command
 from processing.whole_file import whole_file
 
 
