@@ -29,8 +29,7 @@ from processing.reduction.solvers.plain import MuellerSolver
 from processing.reduction.source_level import LeveledSource, SourceLevels
 from processing.reduction.systematic import Systematic
 from processing.storage.captures.capture import Capture
-from processing.storage.products.images import MuellerImage
-from processing.storage.products.mueller_planes import MUELLER_PLANES
+from processing.storage.products.images import MUELLER_PLANES, MuellerImage
 from processing.storage.products.pixel_mask import Mask
 from processing.storage.products.product import Plane
 

@@ -11,10 +11,18 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array, BoolArray
 from processing.storage.captures.schema import CaptureHeader
-from processing.storage.products.product import Product, ProductError, Step
+from processing.storage.products.pixel_mask import Mask
+from processing.storage.products.product import Plane, Product, ProductError, Step
 
 #: Relative size below which a singular value of W is rounding.
 SMALLEST = 1e-8
+#: Planes of every Mueller product.
+MUELLER_PLANES = {
+    "mueller": Plane((4, 4), "count", "Mueller matrix, row-major, not normalized"),
+    "mueller_errors": Plane((4, 4), "count", "standard errors of mueller"),
+    "residual_rms": Plane((), "count", "root mean square over the states of intensity minus fit"),
+    "pixel_flags": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
+}
 
 
 def require_all_elements(product: Product) -> None:
