@@ -97,7 +97,7 @@ class Effect:
 E = TypeVar("E", bound=Effect)
 
 
-def found_in(package: str, family: type[E], group: str) -> dict[str, E]:
+def load_effects(package: str, family: type[E], group: str) -> dict[str, E]:
     """Effects by kind: one concrete class in each module of a package, then plug-ins of an entry point group.
 
     Raises

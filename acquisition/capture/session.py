@@ -27,7 +27,7 @@ from acquisition.screen.observer import Mosaic, Observer
 from acquisition.stop_request import StopRequest
 from processing.arrays import Array
 from processing.instrument.applied_effects import changes_at
-from processing.reduction.lit_darks import LitDarks, seen_so_far
+from processing.reduction.lit_darks import LitDarks, resume_lit_darks
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Status
 
@@ -120,7 +120,7 @@ def _history(
                 "region of its first run."
             )
         require_same_devices(capture, *devices)
-        look, problem = seen_so_far(capture, lights)
+        look, problem = resume_lit_darks(capture, lights)
         if problem is not None:
             raise AcquisitionError(f"{partial}: {problem}. It cannot be resumed: begin the capture again.")
         return Earlier(set(capture.done.tolist()), len(capture.segments), light_so_far(capture), look)

@@ -12,7 +12,7 @@ import typer
 
 from acquisition.commands import by_hand, custody_commands, demo
 from acquisition.commands.defaults import INTERRUPTED, RigFile
-from processing.commands.command_line import Version, application, shown
+from processing.commands.command_line import Version, application, printable
 
 if TYPE_CHECKING:
     from acquisition.stop_request import StopRequest
@@ -128,9 +128,9 @@ def _say_alarms() -> None:
 
 
 def _report(error: BaseException, code: int, text: str | None = None) -> NoReturn:
-    typer.echo(f"error: {shown(text or error)}", err=True)
+    typer.echo(f"error: {printable(text or error)}", err=True)
     for note in getattr(error, "__notes__", []):
-        typer.echo(shown(note), err=True)
+        typer.echo(printable(note), err=True)
     sys.exit(code)
 
 

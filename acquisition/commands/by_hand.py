@@ -44,14 +44,14 @@ def doctor(
     from acquisition.commands.doctor import examine
     from acquisition.screen.rows import print_rows
     from acquisition.stop_request import StopRequest
-    from processing.commands.command_line import shown
+    from processing.commands.command_line import printable
 
     config = _load(rig)
     findings = []
     with StopRequest(patience=1), Console(stderr=True).status("looking at the rig") as status:
         for finding in examine(config, out, frames):
             findings.append(finding)
-            status.update(f"looking at the rig: {escape(shown(finding.title))} done")
+            status.update(f"looking at the rig: {escape(printable(finding.title))} done")
     print_rows(finding.row for finding in findings)
     if faults := [finding.title for finding in findings if finding.well is False]:
         typer.echo(f"not as it should be: {', '.join(faults)}", err=True)

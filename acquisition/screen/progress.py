@@ -9,7 +9,7 @@ from rich.table import Column
 
 from acquisition.screen.observer import Mosaic, Observer, StateReport
 from acquisition.screen.rows import say
-from processing.commands.command_line import shown
+from processing.commands.command_line import printable
 from processing.instrument.states import StateTable
 
 #: Seconds between two lines where the output is a file or a pipe.
@@ -69,7 +69,7 @@ class ConsoleProgress(Observer):
 
     def activity(self, text: str) -> None:
         if self._bar is not None:
-            self._bar.update(self._task, description=shown(text))
+            self._bar.update(self._task, description=printable(text))
         else:
             say(self._console, text)
 

@@ -18,7 +18,7 @@ from processing.instrument.model import InstrumentModel
 from processing.reflectance.tables import ScatteringTable
 from processing.steps.maps import Extrapolation, Quantities, Xi0
 from processing.steps.material import FittedMaterial, MaterialFitting
-from processing.steps.reduction import reduced
+from processing.steps.reduction import reduce_or_open
 from processing.storage.captures.capture import Capture
 from processing.storage.products.product import Product
 from processing.yaml_file import dump_yaml
@@ -93,7 +93,7 @@ def study_body(captures: Path) -> dict[float, BodyProducts]:
     """Mueller image, eigenvalues, extrapolation and polarizer pairs of the body, by wavelength."""
     images: dict[float, dict[str, Path]] = {}
     for path, kind, nm, *_ in find_captures(captures)[0]:
-        images.setdefault(nm, {})[kind] = reduced(path).path
+        images.setdefault(nm, {})[kind] = reduce_or_open(path).path
     products = {}
     for nm, image in images.items():
         extrapolation = Extrapolation(image["stokes"], BODY, TABLE_I).found_or_made().path

@@ -91,7 +91,7 @@ def predict(
         image = view.at(omega, pixels, pixels)
         m0 = model.mueller_jones(image.points, wavelength_nm)
         for name, stokes in states.items():
-            columns[name].append(_summary(predicted(m0, image.points, analyzers, stokes, assumptions=assumed)))
+            columns[name].append(_summary(predict_estimate(m0, image.points, analyzers, stokes, assumptions=assumed)))
         if progress:
             progress(done, len(omega_deg))
     predictions = []
@@ -101,7 +101,7 @@ def predict(
     return sorted(predictions, key=lambda p: p.score)
 
 
-def predicted(
+def predict_estimate(
     m0: Array, points: ScatteringGeometry, analyzers: Array, stokes: Array, *, assumptions: Assumptions
 ) -> Xi0Estimate:
     """Estimate from noise-free intensities with the variance that noise would have: its standard errors count."""

@@ -73,7 +73,7 @@ def move_seconds(angles: Array, speeds: Sequence[Speed]) -> float:
     return float(np.max([s.seconds(step[k]) for k, s in enumerate(speeds)], axis=0).sum())
 
 
-def ordered(angles: Array, periods: Array, speeds: Sequence[Speed]) -> Array:
+def order_states(angles: Array, periods: Array, speeds: Sequence[Speed]) -> Array:
     """(axes, states) in an order that takes little time: nearest first, then pieces turned round while that helps."""
     n = angles.shape[1]
     apart = angles[:, :, None] - angles[:, None, :]
@@ -129,7 +129,7 @@ def front(
     turn = np.array([periods_deg(model)[axis] for axis in model.axes])
     best = free_design(model, states, goal, free_retardances, progress=progress)
     cost = Cost(model, states, goal or Goal(), tuple(best.retardances_deg) if free_retardances else ())
-    angles = ordered(np.stack([best.angles_deg[axis] for axis in model.axes]), turn, rates)
+    angles = order_states(np.stack([best.angles_deg[axis] for axis in model.axes]), turn, rates)
     retardances = np.deg2rad([best.retardances_deg[name] for name in cost.free])
     points = []
     for weight in WEIGHTS:
@@ -137,7 +137,7 @@ def front(
             x = np.concatenate([np.deg2rad(angles).reshape(-1), retardances])
             solved = minimize(_timed(cost, rates, weight), x, jac=True, method="L-BFGS-B", options={"maxiter": 300})
             moved, retardances = cost.split(np.asarray(solved.x))
-            angles = ordered(np.rad2deg(moved), turn, rates)
+            angles = order_states(np.rad2deg(moved), turn, rates)
         design = design_of(model, cost, np.concatenate([np.deg2rad(angles).reshape(-1), retardances]), best.bound)
         points.append(Point(design, move_seconds(angles, rates)))
     points.sort(key=lambda p: p.design.variance)

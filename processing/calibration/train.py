@@ -15,7 +15,7 @@ from scipy.optimize import approx_fprime, least_squares
 from scipy.special import fdtrc
 
 from processing.calibration.known_sample import CalibrationError, KnownCapture
-from processing.calibration.train_values import FITTABLE, TrainValues, checked_names, values_of, with_values
+from processing.calibration.train_values import FITTABLE, TrainValues, check_names, values_of, with_values
 from processing.calibration.wavenumber_curve import WavenumberCurve
 from processing.errors import NotDetermined
 from processing.instrument.model import InstrumentModel
@@ -130,7 +130,7 @@ def fit_trains(parts: Sequence[KnownCapture], free: Sequence[str]) -> list[Calib
     CalibrationError : an unknown parameter, or fewer data than parameters.
     NotDetermined : the data leave a combination of parameters open; the message names them.
     """
-    names = checked_names(parts[0].model, free)
+    names = check_names(parts[0].model, free)
     fit = _Fit(parts, TrainValues.shared(parts[0].model, names, _wavelengths(parts), None))
     minimum = fit.searched_from(fit.nominal, np.ones(len(parts)))
     if len(set(_wavelengths(parts))) > 1:
@@ -149,7 +149,7 @@ def fit_curves(parts: Sequence[KnownCapture], free: Sequence[str], coefficients:
         curve leaves what its value can be.
     NotDetermined : as in `fit_trains`.
     """
-    names = checked_names(parts[0].model, free)
+    names = check_names(parts[0].model, free)
     wavelengths = _wavelengths(parts)
     curve = WavenumberCurve.over(wavelengths, coefficients)
     smooth = _Fit(parts, TrainValues.shared(parts[0].model, names, wavelengths, curve))

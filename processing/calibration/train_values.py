@@ -30,7 +30,7 @@ FITTABLE = {
 MECHANICAL = ("azimuth_deg", "ratio")
 
 
-def checked_names(model: InstrumentModel, free: Sequence[str]) -> tuple[str, ...]:
+def check_names(model: InstrumentModel, free: Sequence[str]) -> tuple[str, ...]:
     """The free parameters, each once; CalibrationError names what this instrument does not have."""
     names = tuple(dict.fromkeys(name.strip() for name in free if name.strip()))
     offered = [f"{e.name}.{field}" for e in model.elements() for field in FITTABLE if _fits(e, field)]

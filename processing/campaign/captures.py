@@ -110,7 +110,7 @@ def _unfinished(folder: Path, out: Path | None) -> list[str]:
     return lines
 
 
-def chosen(
+def choose(
     captures: Sequence[ObjectCapture], modes: Sequence[str] = (), samples: Sequence[str] = (), twins: bool = False
 ) -> tuple[list[ObjectCapture], list[str]]:
     """The captures of these modes and samples (empty: of all), and the others.

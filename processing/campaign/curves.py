@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from processing.campaign.captures import ObjectCapture, chosen, find_captures, flats_of
+from processing.campaign.captures import ObjectCapture, choose, find_captures, flats_of
 from processing.campaign.executors import gather
 from processing.computing.blas import one_blas_thread
 from processing.maps.means import MeanValue, mean_of
@@ -73,10 +73,10 @@ class Curves:
 
         Raises
         ------
-        ProcessError : see `find_captures` and `chosen`.
+        ProcessError : see `find_captures` and `choose`.
         """
         candidates, simulated, left_out, damaged = find_captures(self.folder, self.out, of_objects=False)
-        captures, omitted = chosen(candidates, self.modes, self.samples, twins=True)
+        captures, omitted = choose(candidates, self.modes, self.samples, twins=True)
         self.out.mkdir(parents=True, exist_ok=True)
         flats, corrected = flats_of(self.folder, captures), self.instruments or {}
         tasks = [

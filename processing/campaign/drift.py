@@ -12,7 +12,7 @@ from scipy.stats import norm
 from processing.errors import ProcessError
 from processing.maps.means import Region, mean_of
 from processing.steps.file_step import Progress
-from processing.steps.reduction import reduced
+from processing.steps.reduction import reduce_or_open
 from processing.storage.captures.capture import Capture
 from processing.storage.products.product import Product
 from processing.whole_file import whole_file
@@ -67,7 +67,7 @@ def compare(
     ProcessError : the captures differ in sample, wavelength, frame or origin, or have no pixel in common.
     """
     _require_alike(capture, reference)
-    products = [reduced(path, instrument, progress).path for path in (capture, reference)]
+    products = [reduce_or_open(path, instrument, progress).path for path in (capture, reference)]
     shapes = []
     for path in products:
         with Product(path) as product:

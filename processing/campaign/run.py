@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.campaign.captures import chosen, find_captures, flats_of
+from processing.campaign.captures import choose, find_captures, flats_of
 from processing.campaign.executors import gather
 from processing.campaign.tasks import CaptureMeasure, CaptureTask, locate, measure, task_view
 from processing.computing.blas import one_blas_thread
 from processing.errors import NotDetermined
 from processing.geometry.viewing import ViewingGeometry
-from processing.instrument.uncertainty import of_all_inputs
+from processing.instrument.uncertainty import align_inputs
 from processing.reduction.mueller import Progress
 from processing.reflectance.tables import ScatteringTable
 from processing.storage.products.provenance import Step, file_identity
@@ -123,10 +123,10 @@ class ProcessedCampaign:
 
         Raises
         ------
-        ProcessError : see `find_captures` and `chosen`.
+        ProcessError : see `find_captures` and `choose`.
         """
         candidates, simulated, left_out, damaged = find_captures(self.folder, self.out)
-        captures, omitted = chosen(candidates, self.modes, self.samples)
+        captures, omitted = choose(candidates, self.modes, self.samples)
         left_out = left_out + omitted
         self.out.mkdir(parents=True, exist_ok=True)
         flats = flats_of(self.folder, captures)
@@ -234,7 +234,7 @@ def compare_on_sphere(
         return {"common": 0.0}
     noise = [table.lookup(angles, of=table.uncertainties["u_noise"])[0, common] for table in tables]
     moved = [table.lookup(angles, of=table.directions)[:, 0, common] for table in tables]
-    _, aligned = of_all_inputs([table.inputs for table in tables], moved)
+    _, aligned = align_inputs([table.inputs for table in tables], moved)
     parts = {"": [(b - a)[common]], "noise_": noise, "systematic_": [aligned[1] - aligned[0]]}
     sizes = {f"xi0_{name}percent": 100 * _size(part) for name, part in parts.items()}
     return sizes | {"common": float(common.mean())}

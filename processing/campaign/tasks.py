@@ -10,11 +10,11 @@ from scipy.ndimage import binary_erosion
 from processing.computing.blas import one_blas_thread
 from processing.geometry.errors import OutlineNotFound
 from processing.geometry.frames import GeometryImage
-from processing.geometry.outline import find_sphere, registered
+from processing.geometry.outline import find_sphere, register_sphere
 from processing.geometry.viewing import ViewingGeometry
 from processing.maps.coherency_noise import coherency_noise, largest_deviation_by_noise
 from processing.maps.tables import xi0_samples
-from processing.maps.xi0 import estimate_from_stokes, moved_xi0, refitted
+from processing.maps.xi0 import estimate_from_stokes, moved_xi0, refit
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
 from processing.polarization.eigenvalue_noise import corrected
 from processing.polarization.gradients import dominant
@@ -96,7 +96,7 @@ def locate(task: CaptureTask) -> tuple[float, str] | None:
         circle = find_sphere(intensity)
     except OutlineNotFound:
         return None
-    view = registered(task_view(task), circle, *intensity.shape)
+    view = register_sphere(task_view(task), circle, *intensity.shape)
     return circle.radius_stderr / circle.radius, view.model_dump_json()
 
 
@@ -186,7 +186,7 @@ def _measure_stokes(task: CaptureTask, product: Path, view: ViewingGeometry) -> 
     inside, moves = geometry.mask, None
     if systematic is not None:
         fitted = np.tensordot(image.analyzers, image.values.astype(float), axes=1)
-        moves = refitted(systematic, fitted, result.xi0, m0)[:, inside]
+        moves = refit(systematic, fitted, result.xi0, m0)[:, inside]
     xi0, stderr = result.xi0[inside], result.xi0_stderr[inside]
     good = result.valid[inside] & _inner(geometry, task.border_px)
     return CaptureMeasure(

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from processing.commands.batch import Output, files_of, place_for, run_batch, written_if_changed
+from processing.commands.batch import Output, files_of, place_for, run_batch, write_if_changed
 from processing.commands.command_line import DATA, EXPORT, Overwrite, ProductFile, command
 
 
@@ -68,6 +68,6 @@ def to_axostep_command(
             axostep_of_product(source, name, overwrite)
             return [name]
 
-        return written_if_changed(target, overwrite, write)
+        return write_if_changed(target, overwrite, write)
 
     run_batch("writing", "files", inputs, make)

@@ -164,7 +164,7 @@ def place_for(inputs: Sequence[Path], out: Path | None) -> Callable[[Path], Path
     return lambda usual: out / usual.name
 
 
-def written_if_changed(target: Path, overwrite: bool, write: Callable[[Path], Sequence[Path]]) -> Output:
+def write_if_changed(target: Path, overwrite: bool, write: Callable[[Path], Sequence[Path]]) -> Output:
     """Files for other programs, which do not record their inputs: written again, and compared byte for byte.
 
     Parameters

@@ -85,14 +85,14 @@ def _name_cause(capture: Path, reference: Path, instrument: Path | None) -> None
     from processing.commands.loaded_late.diagnose_summary import show
     from processing.commands.progress_bar import progress_line
     from processing.diagnosis.instrument.diagnose import diagnose_captures
-    from processing.diagnosis.instrument_file import extended
+    from processing.diagnosis.instrument_file import extend_model
     from processing.errors import ProcessError
     from processing.storage.captures.capture import full_model
 
     model = full_model(reference, instrument)
     with progress_line("diagnose the reference", False) as say:
         before, _ = diagnose_captures([reference], model, say)
-    model = extended(model, before.diagnosis)
+    model = extend_model(model, before.diagnosis)
     try:
         with progress_line("diagnose the change", False) as say:
             judged, _ = diagnose_captures([capture], model, say)

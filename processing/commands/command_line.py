@@ -38,7 +38,7 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
 atexit.register(gc.freeze)
 
 
-def shown(text: object) -> str:
+def printable(text: object) -> str:
     """Text as a terminal may get it: control characters of file names and devices as escapes, lines as they are."""
     return CONTROL.sub(lambda match: match[0] if match[0] in "\n\t" else ascii(match[0])[1:-1], str(text))
 
@@ -152,13 +152,13 @@ def run(app: typer.Typer, argv: Sequence[str] | None = None) -> None:
     try:
         app(args=None if argv is None else list(argv))
     except ProcessError as error:
-        typer.echo(f"error: {shown(error)}", err=True)
+        typer.echo(f"error: {printable(error)}", err=True)
         sys.exit(error.exit_code)
     except FileNotFoundError as error:
-        typer.echo(f"error: {shown(error.filename)}: no such file or folder", err=True)
+        typer.echo(f"error: {printable(error.filename)}: no such file or folder", err=True)
         sys.exit(2)
     except OSError as error:
-        typer.echo(f"error: {shown(error)}", err=True)
+        typer.echo(f"error: {printable(error)}", err=True)
         sys.exit(1)
     except SystemExit as ended:
         # Typer turns Ctrl-C into this exit code, without a word.

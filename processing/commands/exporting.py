@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from processing.commands.batch import Output, files_of, place_for, run_batch, written_if_changed
+from processing.commands.batch import Output, files_of, place_for, run_batch, write_if_changed
 from processing.commands.command_line import EXPORT, command
 
 
@@ -39,6 +39,6 @@ def export_command(
 
     def make(source: Path, _: object) -> Output:
         target = place(source.with_suffix(""))
-        return written_if_changed(target, overwrite, lambda name: export(source, to, name, plane or ()))
+        return write_if_changed(target, overwrite, lambda name: export(source, to, name, plane or ()))
 
     run_batch("exporting", "files", inputs, make)

@@ -60,7 +60,7 @@ def register_command(
     import numpy as np
 
     from processing.geometry.mesh import Mesh
-    from processing.geometry.outline import find_sphere, registered
+    from processing.geometry.outline import find_sphere, register_sphere
     from processing.geometry.pose import refine_pose
     from processing.geometry.viewing import ViewingGeometry
     from processing.storage.products.product import Product
@@ -81,7 +81,7 @@ def register_command(
         typer.echo("  standard errors, turn in degrees and shift in mm: " + " ".join(f"{v:.3g}" for v in fit.stderr))
     else:
         circle = find_sphere(image)
-        view = registered(view, circle, rows, columns)
+        view = register_sphere(view, circle, rows, columns)
         typer.echo(
             f"  centre at row {circle.row:.2f} +- {circle.row_stderr:.2f}, column {circle.column:.2f} +- "
             f"{circle.column_stderr:.2f}; radius {circle.radius:.2f} +- {circle.radius_stderr:.2f} pixels"

@@ -38,7 +38,7 @@ def mean_command(
     from processing.export.means_file import write_means
     from processing.maps.means import mean_of
     from processing.maps.region import parse_region
-    from processing.steps.reduction import reduced
+    from processing.steps.reduction import reduce_or_open
     from processing.storage.products.product import Product
 
     if out is not None:
@@ -50,7 +50,7 @@ def mean_command(
     products = []
     with progress_bar("reducing", "rows") as tick:
         for path in inputs:
-            products.append(reduced(path, instrument, tick).path)
+            products.append(reduce_or_open(path, instrument, tick).path)
     places, simulated = [], False
     for path in products:
         with Product(path) as product:

@@ -39,14 +39,14 @@ def quantities_command(
     from processing.maps.quantities import require_decompositions
     from processing.polarization.quantities import PAPER_PAIRS
     from processing.steps.maps import Quantities
-    from processing.steps.reduction import reduced
+    from processing.steps.reduction import reduce_or_open
 
     pairs = {**PAPER_PAIRS, **dict(_pair(text) for text in pair or ())}
     # Before a capture is reduced for nothing.
     require_decompositions(also or ())
 
     def step_of(source: Path, tick: Progress) -> tuple[FileStep, StepProduct | None]:
-        image = reduced(source, instrument, tick)
+        image = reduce_or_open(source, instrument, tick)
         return Quantities(image.path, tuple(also or ()), pairs), image if image.path != source else None
 
     inputs = files_of(sources, captures_and(("mueller", "extrapolated")), "Mueller captures")

@@ -98,10 +98,10 @@ def extrapolate_command(
 ) -> None:
     """A full Mueller image from a linear Stokes capture: TD model with the estimated xi0 and M00."""
     from processing.steps.maps import Extrapolation
-    from processing.steps.reduction import reduced
+    from processing.steps.reduction import reduce_or_open
 
     def step_of(source: Path, tick: Progress) -> tuple[FileStep, StepProduct | None]:
-        image = reduced(source, progress=tick)
+        image = reduce_or_open(source, progress=tick)
         return Extrapolation(image.path, geometry, material), image if image.path != source else None
 
     inputs = files_of(sources, captures_and(("stokes",)), "Stokes captures")

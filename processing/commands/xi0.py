@@ -35,12 +35,12 @@ def xi0_command(
 ) -> None:
     """xi0 from a Mueller capture (coherency eigenvalues), or from less with a model (two coefficients)."""
     from processing.steps.maps import Xi0
-    from processing.steps.reduction import reduced
+    from processing.steps.reduction import reduce_or_open
     from processing.storage.products.images import seen_elements
     from processing.storage.products.product import Product
 
     def step_of(source: Path, tick: Progress) -> tuple[FileStep, StepProduct | None]:
-        image = reduced(source, instrument, tick)
+        image = reduce_or_open(source, instrument, tick)
         with Product(image.path) as product:
             if product.kind == "mueller" and seen_elements(product.facts).all() and (geometry or material):
                 text = "holds whole Mueller matrices: --geometry and --material are not looked at"

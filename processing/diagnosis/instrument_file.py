@@ -18,7 +18,7 @@ class WriteError(ProcessError):
     """The new instrument file cannot be written."""
 
 
-def extended(model: InstrumentModel, diagnosis: Diagnosis) -> InstrumentModel:
+def extend_model(model: InstrumentModel, diagnosis: Diagnosis) -> InstrumentModel:
     """The instrument model (as in its file, at all its wavelengths) with the diagnosis put in.
 
     Effects come behind those that it has; values that the file calls nominal are replaced by what was fitted. An
@@ -61,7 +61,7 @@ def file_head(first: str, note: str) -> str:
 
 
 def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis, note: str = "") -> None:
-    """Write `extended` to a new file.
+    """Write `extend_model` to a new file.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis, n
         if diagnosis.correction is not None and diagnosis.correction.refused is not None:
             raise WriteError(f"{path} was not written: {diagnosis.correction.refused}.")
         raise WriteError(f"nothing was found that could go into {path}; it was not written.")
-    text = dump_yaml(extended(model, diagnosis))
+    text = dump_yaml(extend_model(model, diagnosis))
     try:
         parse_yaml(text, InstrumentModel, source=str(path))
     except ConfigError as error:

@@ -91,7 +91,7 @@ def find_sphere(image: ArrayLike, seed: int = 0) -> Circle:
     )
 
 
-def registered(view: ViewingGeometry, circle: Circle, rows: int, columns: int) -> ViewingGeometry:
+def register_sphere(view: ViewingGeometry, circle: Circle, rows: int, columns: int) -> ViewingGeometry:
     """The viewing geometry with centre and scale taken from the outline of its sphere, for images of that size.
 
     The sphere's radius and the camera's distance are trusted; the focal length follows from the outline.

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from processing.effect import EffectError, Parameter, found_in
+from processing.effect import EffectError, Parameter, load_effects
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects.base import InstrumentEffect
 from processing.instrument.model import AppliedEffect, InstrumentModel
@@ -19,7 +19,7 @@ ENTRY_POINTS = "umov.effects"
 @cache
 def instrument_effects() -> dict[str, InstrumentEffect]:
     """Effects of the instrument by kind: the files of the folder, then plug-ins."""
-    return found_in("processing.instrument.effects", InstrumentEffect, ENTRY_POINTS)  # type: ignore[type-abstract]
+    return load_effects("processing.instrument.effects", InstrumentEffect, ENTRY_POINTS)  # type: ignore[type-abstract]
 
 
 def apply_to(changes: Changes, model: InstrumentModel, applied: AppliedEffect) -> None:

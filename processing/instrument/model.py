@@ -25,7 +25,7 @@ from processing.instrument.fitted import AppliedEffect as AppliedEffect
 from processing.instrument.fitted import EffectParameter as EffectParameter
 from processing.instrument.fitted import SystematicError as SystematicError
 from processing.instrument.measured_matrix import MeasuredMatrix
-from processing.instrument.stated_uncertainty import TRAINS, Correlation, without_u
+from processing.instrument.stated_uncertainty import TRAINS, Correlation, split_uncertainties
 from processing.section import Section
 from processing.yaml_file import load_yaml
 
@@ -131,7 +131,7 @@ class InstrumentModel(Section):
         if data.get("measured") is not None:
             data = {"generator": (), "analyzer": ()} | dict(data)
         errors: dict[str, Any] = {}
-        plain = {key: without_u(node, errors) if key in TRAINS else node for key, node in data.items()}
+        plain = {key: split_uncertainties(node, errors) if key in TRAINS else node for key, node in data.items()}
         stated = plain.get("stderr") or {}
         if not errors or not isinstance(stated, Mapping):
             return plain

@@ -43,15 +43,15 @@ class Correlation(Section):
         return np.asarray(matrix + matrix.T + np.eye(len(matrix)))
 
 
-def without_u(node: Any, errors: dict[str, Any]) -> Any:
+def split_uncertainties(node: Any, errors: dict[str, Any]) -> Any:
     """A train as a file has it, without standard uncertainties; those by "element.field" are put into `errors`."""
     if isinstance(node, list | tuple):
-        return [without_u(part, errors) for part in node]
+        return [split_uncertainties(part, errors) for part in node]
     if not isinstance(node, Mapping):
         return node
     plain = {}
     for field, value in node.items():
-        plain[field] = without_u(value, errors) if field in TRAINS else value
+        plain[field] = split_uncertainties(value, errors) if field in TRAINS else value
         if field in TRAINS or not isinstance(value, Mapping):
             continue
         if set(value) == {"value", "u"}:

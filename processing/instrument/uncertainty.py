@@ -49,7 +49,7 @@ def value_directions(model: InstrumentModel) -> Iterator[ValueDirection]:
                 yield ValueDirection(" & ".join(names), np.nan, _moved(model, shift))
 
 
-def of_all_inputs(inputs: Sequence[tuple[str, ...]], moves: Sequence[Array]) -> tuple[tuple[str, ...], list[Array]]:
+def align_inputs(inputs: Sequence[tuple[str, ...]], moves: Sequence[Array]) -> tuple[tuple[str, ...], list[Array]]:
     """Effect of the inputs of all instruments on each of several results; zero for the inputs of other instruments.
 
     Parameters

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.maps.xi0 import dominant_model, estimate_from_stokes, refitted
+from processing.maps.xi0 import dominant_model, estimate_from_stokes, refit
 from processing.polarization import triply_degenerate
 from processing.reduction.systematic import INPUTS, Systematic
 from processing.storage.products.images import StokesImage
@@ -79,7 +79,7 @@ def extrapolate_mueller(
     if systematic is not None:
         fitted = np.tensordot(image.analyzers, image.values.astype(float), axes=1)
         # Of M/m00 alone: M = m00 e00 + alpha_0 (m0 - e00), and alpha_0/m00 = (4 xi0 - 1)/3.
-        moved = 4 / 3 * estimate.m00 * refitted(systematic, fitted, estimate.xi0, m0)
+        moved = 4 / 3 * estimate.m00 * refit(systematic, fitted, estimate.xi0, m0)
         of_alpha_0 = np.sqrt(np.square(moved).sum(axis=0))
         planes["mueller_systematic"] = _planar(np.abs(m0) * of_alpha_0[..., None, None])
         planes["mueller_systematic"][0, 0] = 0.0 * of_alpha_0

@@ -18,11 +18,11 @@ from scipy.special import stdtrit
 
 from processing.arrays import Array
 from processing.errors import ProcessError
-from processing.instrument.uncertainty import of_all_inputs
+from processing.instrument.uncertainty import align_inputs
 from processing.maps.intervals import ANGLES, EITHER_AXIS
 from processing.maps.partial_quantities import determined_maps, partial_block
 from processing.maps.quantities import quantities_block
-from processing.maps.stokes_vector import is_first_column, light_of, light_quantities, moves_of_light, named
+from processing.maps.stokes_vector import is_first_column, light_of, light_quantities, moves_of_light, rename_planes
 from processing.polarization.magnitude import NORMAL_95
 from processing.polarization.quantities import PAPER_PAIRS
 from processing.reduction.stokes import linear_polarization, moved_polarization
@@ -272,7 +272,7 @@ def _combine(means: Sequence[_Mean]) -> _Mean:
     scale = level.mean() / level
     values = np.mean([c * mean.image.values for c, mean in zip(scale, means, strict=True)], axis=0)
     u_of = {name: u for mean in means for name, u in mean.inputs}
-    names, moved = of_all_inputs([tuple(name for name, _ in mean.inputs) for mean in means], [m.moves for m in means])
+    names, moved = align_inputs([tuple(name for name, _ in mean.inputs) for mean in means], [m.moves for m in means])
     moves = np.mean([c * move for c, move in zip(scale, moved, strict=True)], axis=0)
     first, image = replace(first, inputs=tuple((name, u_of[name]) for name in names)), first.image
     if isinstance(image, StokesImage):
@@ -338,7 +338,7 @@ def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
         planes = partial_block(image, names, PAPER_PAIRS)
         partial_block(image, names, PAPER_PAIRS, moves, by_input=by_input)
     if light:
-        planes, by_input = named(planes), named(by_input)
+        planes, by_input = rename_planes(planes), rename_planes(by_input)
     for name in by_input:
         # 16 elements of the dominant process would make a table that nobody reads.
         if planes[name].size == 16:

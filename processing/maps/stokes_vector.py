@@ -116,10 +116,10 @@ def light_block(product: Product, rows: slice, systematic: Systematic | None = N
     planes["stokes_covariance"] = np.moveaxis(covariance[..., _PACKED[0], _PACKED[1]], -1, 0).astype(np.float32)
     if moves is not None:
         planes["stokes_systematic"] = np.sqrt(np.square(moves[:, ::4]).sum(axis=0)).astype(np.float32)
-    return planes | named(partial_block(image, light_quantities(image.is_determined), {}, moves))
+    return planes | rename_planes(partial_block(image, light_quantities(image.is_determined), {}, moves))
 
 
-def named(planes: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def rename_planes(planes: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Planes of the polarizance under the names that they have here."""
     new_names = {name + suffix: NAMES[name][0] + suffix for name in NAMES for suffix in ("", *COMPANIONS)}
     return {new_names.get(name, name): plane for name, plane in planes.items()}

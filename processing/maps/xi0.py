@@ -172,7 +172,7 @@ def _systematic_facts(systematic: Systematic, errors: NDArray[Any]) -> dict[str,
     return {INPUTS: "; ".join(systematic.labels), "median_xi0_systematic": _median(errors)}
 
 
-def refitted(
+def refit(
     systematic: Systematic, fitted: NDArray[np.floating], xi0: NDArray[np.float64], m0: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Change (D, ...) by each direction of xi0, the two-coefficient estimate of intensities (K, rows, columns)."""
@@ -273,7 +273,7 @@ def _two_coefficients(
     }
     facts["unphysical_pixels"] = int(result.unphysical.sum())
     if systematic is not None:
-        set_xi0_systematic(planes, refitted(systematic, fitted, result.xi0, m0))
+        set_xi0_systematic(planes, refit(systematic, fitted, result.xi0, m0))
         facts |= _systematic_facts(systematic, planes["xi0_systematic"][result.valid])
     rows, columns = result.xi0.shape
     every = STOKES_PLANES | systematic_planes(systematic)

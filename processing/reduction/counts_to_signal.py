@@ -12,7 +12,7 @@ from processing.reduction.black import Black
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.flat import FlatField
 from processing.reduction.frame_evidence import evidence_of
-from processing.reduction.lit_darks import leaked_light, seen_so_far
+from processing.reduction.lit_darks import leaked_light, resume_lit_darks
 from processing.storage.captures.capture import Capture, CaptureError
 from processing.storage.products.pixel_mask import Mask
 
@@ -95,7 +95,7 @@ class CountCorrection:
 def _of_light(capture: Capture) -> list[str]:
     """Warnings where the light was on for the darks, or not on at all."""
     lights = _light(capture)
-    look, lit = seen_so_far(capture, lights.size)
+    look, lit = resume_lit_darks(capture, lights.size)
     if lit is not None:
         return [f"{lit}. Subtracting them leaves no signal: take the capture again with the light shut off"]
     unlit = [look.without_light(float(exposure_s)) for exposure_s in np.unique(capture.column("exposure_s")[lights])]

@@ -90,7 +90,7 @@ class LitDarks:
         return f"the light states of {exposure_s:g} s are no brighter than the dark ones"
 
 
-def seen_so_far(capture: Capture, lights: int) -> tuple[LitDarks, str | None]:
+def resume_lit_darks(capture: Capture, lights: int) -> tuple[LitDarks, str | None]:
     """A comparison that has seen the states of a capture, of which `lights` will be light, and what it found."""
     header = capture.header
     look = LitDarks(header.detector.black_level_counts, mosaic=header.mosaic is not None, lights=lights)

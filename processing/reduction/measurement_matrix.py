@@ -25,7 +25,7 @@ def angles_of(capture: Capture, model: InstrumentModel, states: NDArray[np.int64
     bad = ~np.all([np.ones(len(states), dtype=bool), *read], axis=0)
     if np.any(bad):
         raise CaptureError(
-            f"{capture.path}: no read-back angle in state(s) {some_of(states[bad])}; they cannot be reduced."
+            f"{capture.path}: no read-back angle in state(s) {short_list(states[bad])}; they cannot be reduced."
         )
     return angles
 
@@ -86,7 +86,7 @@ def relative_exposure(capture: Capture, states: NDArray[np.int64]) -> NDArray[np
     return np.asarray(exposure / exposure.max())
 
 
-def some_of(values: NDArray[np.int64]) -> str:
+def short_list(values: NDArray[np.int64]) -> str:
     """The first five numbers, for a message."""
     shown = ", ".join(str(v) for v in values[:5])
     return shown + (" ..." if len(values) > 5 else "")

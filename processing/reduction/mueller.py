@@ -16,7 +16,7 @@ from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.effects_of_capture import references
 from processing.reduction.exclusions import Exclusions
 from processing.reduction.facts import mueller_facts
-from processing.reduction.measurement_matrix import exposure_fact, some_of
+from processing.reduction.measurement_matrix import exposure_fact, short_list
 from processing.reduction.mueller_reduction import Choice, MuellerReduction
 from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.base import Solver
@@ -129,4 +129,4 @@ def _without_numbers(capture: Capture, states: NDArray[np.int64]) -> str:
     empty = np.array([k for k in states if not np.isfinite(capture.frames(int(k))).any()], dtype=np.int64)
     if not empty.size:
         return ""
-    return f" State(s) {some_of(empty)} hold no number at all: take them again, or import without them."
+    return f" State(s) {short_list(empty)} hold no number at all: take them again, or import without them."

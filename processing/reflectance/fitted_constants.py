@@ -154,7 +154,7 @@ def search(residual: Callable[[Array], Array], of: Ranges, near: Array | None = 
     return np.asarray(best.x), np.asarray(best.jac)
 
 
-def unexplained(residual: Array, changes: Sequence[Array]) -> float:
+def unexplained_square(residual: Array, changes: Sequence[Array]) -> float:
     """Sum of squares of a residual in units of the noise, where each of `changes` may be in it, of unit variance."""
     square = float(np.sum(residual**2))
     if not changes:

@@ -29,7 +29,7 @@ from processing.reflectance.fitted_constants import (
     evenly,
     result_of,
     search,
-    unexplained,
+    unexplained_square,
 )
 
 DIFFUSE = Ranges(
@@ -112,7 +112,7 @@ def _fit_dominant(model: "_Forward", data: Array, covariance: Array, moved: Sequ
     noise = np.einsum("nki,nij,nlj->nkl", parts, covariance, parts, optimize=True)
     whiten = np.linalg.inv(np.linalg.cholesky(noise)) @ parts
     residual, *changes = (np.einsum("nki,ni->nk", whiten, values) for values in (data, *moved))
-    square = unexplained(residual, [change - residual for change in changes])
+    square = unexplained_square(residual, [change - residual for change in changes])
     free = 6 * len(data) - 4
     return result_of(
         constants, -curvature.sum(axis=0), scores, square, free=free, method="dominant process", off=off, of=DIFFUSE
@@ -238,7 +238,7 @@ def _fit_correlation(reference: _Correlation, moved: Sequence[_Correlation]) -> 
         extra -= unit * np.sum(unit * extra, axis=1, keepdims=True)
         departures.append(np.einsum("nkp,nk->p", slopes, extra))
         unlike += float(np.sum(extra**2))
-    square, free = unexplained(residual, changes), residual.size - 2 * len(residual) - 4
+    square, free = unexplained_square(residual, changes), residual.size - 2 * len(residual) - 4
     # Eigenvalues may differ by more than usual: by as much as makes the residual.
     more = max(1.0, float(np.sqrt(max(square - free, 0) / unlike)))
     scores, curvature = np.einsum("nkp,nk->np", slopes, residual), jacobian.T @ jacobian

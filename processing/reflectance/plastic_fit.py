@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from processing.arrays import Array
 from processing.geometry.frames import ScatteringGeometry
-from processing.reflectance.fitted_constants import MaterialFit, Ranges, evenly, result_of, search, unexplained
+from processing.reflectance.fitted_constants import MaterialFit, Ranges, evenly, result_of, search, unexplained_square
 from processing.reflectance.rough_plastic import processes
 
 PLASTIC = Ranges(
@@ -55,7 +55,7 @@ def fit_plastic(
     constants, jacobian = search(partial(residual, data=each[0][0], back=each[0][1]), PLASTIC)
     off = [search(partial(residual, data=v, back=w), PLASTIC, constants)[0] - constants for v, w in each[1:]]
     base, *changed = (residual(constants, *data) for data in each)
-    square = unexplained(base, [change - base for change in changed])
+    square = unexplained_square(base, [change - base for change in changed])
     return result_of(
         constants,
         jacobian.T @ jacobian,

@@ -15,7 +15,7 @@ from processing.arrays import Array
 from processing.computing.threads import for_ranges
 from processing.errors import ProcessError
 from processing.geometry.rusinkiewicz import Angles
-from processing.instrument.uncertainty import of_all_inputs
+from processing.instrument.uncertainty import align_inputs
 from processing.reflectance.table_axes import SHAPE, Layout, TableAxes
 from processing.reflectance.table_kernels import add_sums, claim_rows
 from processing.storage.captures.nexus import add_group, add_scales, attach, declare, default_plot, describe_light
@@ -228,7 +228,7 @@ class ScatteringTable:
             raise TableError(f"tables differ and cannot be merged: {this} and {that}")
         quantities, start = len(self.quantities), len(self.quantities) * (1 + self.has_noise)
         parts = [t._sum[start:].reshape(-1, quantities, t.count.size) for t in (self, other)]
-        self.inputs, (base, more) = of_all_inputs([self.inputs, other.inputs], parts)
+        self.inputs, (base, more) = align_inputs([self.inputs, other.inputs], parts)
         self._sum = np.concatenate([self._sum[:start], base.reshape(-1, self.count.size)])
         rows = other.bins.copy()
         self._claim(rows)

@@ -100,6 +100,6 @@ class FileStep(OfFiles, ABC):
         return StepProduct(target, False)
 
 
-def beside(source: Path, kind: str) -> Path:
+def path_beside(source: Path, kind: str) -> Path:
     """Name of a product of this kind beside the product that it is made from: `NAME.kind.h5` for `NAME.other.h5`."""
     return source.with_name(f"{source.name.removesuffix('.h5').rsplit('.', 1)[0]}.{kind}.h5")

@@ -6,7 +6,7 @@ from pathlib import Path
 from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
 from processing.polarization.quantities import PAPER_PAIRS, NamedStokes
-from processing.steps.file_step import FileStep, Progress, beside
+from processing.steps.file_step import FileStep, Progress, path_beside
 from processing.storage.products.product import Product
 from processing.storage.products.provenance import Step, file_identity
 
@@ -39,7 +39,7 @@ class Quantities(FileStep):
     @property
     def usual_path(self) -> Path:
         """Beside the source."""
-        return beside(self.source, "quantities")
+        return path_beside(self.source, "quantities")
 
     def record(self) -> Step:
         """Decompositions, pairs and the source."""
@@ -78,7 +78,7 @@ class Xi0(FileStep):
     @property
     def usual_path(self) -> Path:
         """Beside the source."""
-        return beside(self.source, "xi0")
+        return path_beside(self.source, "xi0")
 
     def record(self) -> Step:
         """The source; of a Stokes product geometry and material too, which a Mueller product does not need."""
@@ -140,7 +140,7 @@ class Extrapolation(FileStep):
     @property
     def usual_path(self) -> Path:
         """Beside the source."""
-        return beside(self.source, "extrapolated")
+        return path_beside(self.source, "extrapolated")
 
     def record(self) -> Step:
         """Source, geometry and material."""

@@ -152,7 +152,7 @@ class Reduction(FileStep):
             )
 
 
-def reduced(source: Path, instrument: Path | None = None, progress: Progress | None = None) -> StepProduct:
+def reduce_or_open(source: Path, instrument: Path | None = None, progress: Progress | None = None) -> StepProduct:
     """A product as it is; for a capture its plain product, found or made.
 
     Raises

@@ -16,7 +16,7 @@ from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.tables import ScatteringTable, table_steps
 from processing.steps.maps import Quantities, Xi0, geometry_identities
-from processing.steps.reduction import Reduction, reduced
+from processing.steps.reduction import Reduction, reduce_or_open
 from processing.storage.captures.capture import Capture, CaptureError
 from processing.storage.integrity.checksums import row_crc32, write_checksums
 from processing.storage.products import provenance
@@ -214,7 +214,7 @@ def test_names_that_are_taken_are_refused(capture, configs, tmp_path):
     with pytest.raises(ProcessError, match="exists"):
         step.make()
     with pytest.raises(ProcessError, match="is reduced already"):
-        reduced(step.usual_path, configs / "instruments/rgb950.yaml")
+        reduce_or_open(step.usual_path, configs / "instruments/rgb950.yaml")
 
 
 def test_campaign_makes_nothing_twice_and_takes_nothing_for_another(original, configs, tmp_path):

@@ -11,7 +11,7 @@ import pytest
 from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument_file import extended
+from processing.diagnosis.instrument_file import extend_model
 from processing.diagnosis.search.result import Check
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
@@ -198,7 +198,7 @@ def test_the_gain_learnt_on_one_picture_mends_another(public_files, configs, tmp
     assert gain.probability == 0.9
     assert "channel_extinction" in gain.indistinguishable_from
     # Clipped pixels belong to the one picture; the gains of the channels belong to the camera.
-    carried = extended(model, learnt).at(550)
+    carried = extend_model(model, learnt).at(550)
     # What is carried is the mean over gains and extinctions, which these pictures cannot tell apart. The closure over
     # the gains sees the gains alone; the model's own residual sees both.
     other, left = capture("fruits"), []

@@ -5,7 +5,7 @@ import pytest
 from typer.testing import CliRunner
 
 from processing.calibration.free_angles import Cost, Goal, bound_of, free_design
-from processing.calibration.motor_time import Speed, front, move_seconds, ordered, periods_deg
+from processing.calibration.motor_time import Speed, front, move_seconds, order_states, periods_deg
 from processing.calibration.robustness import errors_of_table
 from processing.calibration.state_design import AssumedNoise, score
 from processing.commands.application import app
@@ -94,7 +94,7 @@ def test_order_keeps_every_pose(rgb950):
     assert periods_deg(rgb950) == {"psg": 180.0, "psa": 180.0}
     angles = np.random.default_rng(2).uniform(0, 360, (2, 30))
     speeds = [Speed(20, 40)] * 2
-    found = ordered(angles, np.array([180.0, 180.0]), speeds)
+    found = order_states(angles, np.array([180.0, 180.0]), speeds)
     assert sorted(map(tuple, np.round(found.T % 180, 6))) == sorted(map(tuple, np.round(angles.T % 180, 6)))
     assert move_seconds(found, speeds) < 0.6 * move_seconds(angles, speeds)
 

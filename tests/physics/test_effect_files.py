@@ -15,7 +15,7 @@ import pytest
 
 import processing
 from processing.diagnosis.search.candidate import pool
-from processing.effect import BASE, EffectError, found_in
+from processing.effect import BASE, EffectError, load_effects
 from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.changes import Conditions
 from processing.instrument.effects.base import InstrumentEffect
@@ -187,7 +187,7 @@ def test_a_plug_in_is_found_for_both_kinds(monkeypatch):
 
     asked = []
     monkeypatch.setattr("processing.effect.entry_points", lambda group: asked.append(group) or [EntryPoint(Gremlin)])
-    found = found_in(FOLDERS[1], ReflectanceEffect, "umov.reflectance_effects")
+    found = load_effects(FOLDERS[1], ReflectanceEffect, "umov.reflectance_effects")
     assert (found["gremlin"].kind, asked) == ("gremlin", ["umov.reflectance_effects"])
 
 
@@ -199,4 +199,4 @@ def test_a_file_without_just_one_effect_is_refused(text, tmp_path, monkeypatch):
     (tmp_path / name / "thing.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(EffectError, match="thing has to define one InstrumentEffect"):
-        found_in(name, InstrumentEffect, "nothing")
+        load_effects(name, InstrumentEffect, "nothing")

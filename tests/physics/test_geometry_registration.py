@@ -10,7 +10,7 @@ import trimesh
 from processing.geometry.camera_pose import Board, calibrate
 from processing.geometry.errors import GeometryError, OutlineNotFound
 from processing.geometry.mesh import Mesh
-from processing.geometry.outline import find_sphere, registered
+from processing.geometry.outline import find_sphere, register_sphere
 from processing.geometry.pinhole import PinholeCamera
 from processing.geometry.pose import refine_pose
 from processing.geometry.sphere import Sphere
@@ -52,7 +52,7 @@ def test_sphere_is_found_within_its_standard_errors(configs, omega_deg):
     assert abs(circle.column - camera.axis_px[1]) < 3 * circle.column_stderr
     assert abs(circle.radius - radius) < 3 * circle.radius_stderr
     assert circle.radius_stderr < 0.01 * radius
-    view = registered(stated, circle, 300, 320)
+    view = register_sphere(stated, circle, 300, 320)
     assert view.camera.focal_length_mm == pytest.approx(60 * 0.97, rel=0.006)
     assert view.camera.axis_px == pytest.approx(camera.axis_px, abs=1.2)
 

@@ -12,7 +12,7 @@ from processing.diagnosis.instrument.initial_values import along_wavelengths
 from processing.diagnosis.instrument.mueller_error import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.whole_bench import WholeBench
-from processing.diagnosis.instrument_file import extended
+from processing.diagnosis.instrument_file import extend_model
 from processing.diagnosis.search.fit import Fit, held_out, minimize
 from processing.diagnosis.search.result import Correction, Diagnosis, Error
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets
@@ -193,7 +193,7 @@ def test_the_file_has_a_value_for_each_wavelength_and_mechanics_for_all():
     terms = {n: EffectParameter(value=0.1, unit="degree") for n in ("cos_1", "sin_1", "cos_2", "sin_2")}
     eccentric = AppliedEffect(kind="rotation_eccentricity", element="psg", parameters=terms)
     drawn = {"psg_retarder.azimuth_deg": mount, "psg_retarder.retardance_deg": plate}
-    written = extended(train(), diagnosis(drawn, (eccentric,)))
+    written = extend_model(train(), diagnosis(drawn, (eccentric,)))
     assert written.at(500.0).generator[1].retardance_deg == 118.0
     assert written.at(600.0).generator[1].azimuth_deg == 3.0
     # At another wavelength the mechanics hold, and what is nominal anyway starts from the neighbours.

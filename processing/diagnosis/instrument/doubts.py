@@ -10,7 +10,7 @@ from processing.diagnosis.instrument.edges import at_edges
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.unevenness import Evenness
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import Cause, shown
+from processing.diagnosis.search.causes import Cause, significance
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.names import AT_BOUND, at_bound, with_parts
 from processing.diagnosis.search.posterior import Posterior
@@ -89,7 +89,7 @@ def testable(problem: InstrumentProblem, solved: Solution, cause: Cause, causes:
     those of other causes that are more certain: what hardly takes part does not make them as many as the data.
     """
     before = [c for rival in causes if rival is cause or rival.log_odds > cause.log_odds for c in rival.candidates]
-    sizes = [shown(*entry) for entry in zip(cause.values, cause.covariance, strict=True)]
+    sizes = [significance(*entry) for entry in zip(cause.values, cause.covariance, strict=True)]
     least = min(1.0, max(sizes))
     excess = max(solved.before.excess, 0.0)
     values, directions, shows = [], [], []

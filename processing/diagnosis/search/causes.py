@@ -90,7 +90,7 @@ def causes(posterior: Posterior, chi2: float) -> tuple[Cause, ...]:
     return tuple(sorted(result, key=lambda c: -c.log_odds))
 
 
-def shown(values: Array, covariance: Array) -> float:
+def significance(values: Array, covariance: Array) -> float:
     """Chi-square of values (N,) over that from which on so many are not zero: three standard deviations."""
     n = values.size
     return float(values @ np.linalg.lstsq(covariance, values)[0]) / max(SHOWN**2, n + SHOWN * float(np.sqrt(2 * n)))

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import Cause, information, shown, wanted_for_evidence
+from processing.diagnosis.search.causes import Cause, information, significance, wanted_for_evidence
 from processing.diagnosis.search.decision import Judgement, held_out_check, refusal, rows_checks
 from processing.diagnosis.search.fit import HeldOut, Solution
 from processing.diagnosis.search.names import Names, answer_of
@@ -181,7 +181,7 @@ def effects_of_cause(
         for entry in zip(cause.candidates, cause.values, cause.covariance, strict=True)
         for at in entry[0].by_wavelength(*entry[1:])
     ]
-    sizes = [shown(values, covariance) for _, values, covariance in each]
+    sizes = [significance(values, covariance) for _, values, covariance in each]
     for (candidate, values, covariance), size in zip(each, sizes, strict=True):
         if size < min(1.0, max(sizes)):
             continue

@@ -6,7 +6,7 @@ from functools import cache
 from typing import ClassVar, Literal
 
 from processing.arrays import Array
-from processing.effect import Effect, Parameter, found_in
+from processing.effect import Effect, Parameter, load_effects
 from processing.geometry.viewing import ViewingGeometry
 from processing.reflectance.changes import ReflectanceChanges
 
@@ -47,4 +47,4 @@ class ReflectanceEffect(Effect, ABC):
 @cache
 def reflectance_effects() -> dict[str, ReflectanceEffect]:
     """Effects of the reflectance by kind: the files of the folder, then plug-ins."""
-    return found_in("processing.reflectance.effects", ReflectanceEffect, ENTRY_POINTS)  # type: ignore[type-abstract]
+    return load_effects("processing.reflectance.effects", ReflectanceEffect, ENTRY_POINTS)  # type: ignore[type-abstract]
