@@ -169,9 +169,9 @@ class Changes:
     def add(self, other: "Changes") -> None:
         """Add what others ask for, of the same conditions."""
         for name in ADDED:
-            own, more = getattr(self, name), getattr(other, name)
+            total, more = getattr(self, name), getattr(other, name)
             for key, value in more.items():
-                own[key] = own[key] + value
+                total[key] = total[key] + value
         for element, mueller in other.after.items():
             self.follow(element, mueller)
         for element, mueller in other.before.items():

@@ -37,7 +37,7 @@ NAMES = {
     ),
 }
 #: The name that the same quantity of a matrix has, by its name here.
-OF_MATRICES = {own: name for name, (own, _) in NAMES.items()}
+OF_MATRICES = {of_light: name for name, (of_light, _) in NAMES.items()}
 #: Elements of the packed covariance, by row and column.
 _PACKED = tuple(zip(*[(k, k) for k in range(4)], *[(i, j) for i in range(4) for j in range(i + 1, 4)], strict=True))
 _COVARIANCE = Plane((10,), "count2", "covariance of S: 00, 11, 22, 33, 01, 02, 03, 12, 13, 23; NaN: not determined")

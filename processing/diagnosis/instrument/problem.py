@@ -225,28 +225,28 @@ class InstrumentProblem:
         changes = Changes(data.conditions, built=built)
         changes.add(self._changes_of(capture, None, np.zeros(0)))
         # At zero an effect does nothing: there is no need to ask it.
-        for candidate, own in space.other_than_zero(values):
+        for candidate, part in space.other_than_zero(values):
             if candidate.acts(capture, data.wavelength_nm):
-                changes.add(self._changes_of(capture, candidate, own))
+                changes.add(self._changes_of(capture, candidate, part))
         return changes
 
     def _changes_of(self, capture: int, candidate: Candidate | None, values: Array) -> Changes:
         """Changes of one capture by one candidate alone, not to be altered; None: by the instrument's own effects."""
-        known, model, data = self._asked[capture], self.models[capture], self.captures[capture]
+        cache, model, data = self._asked[capture], self.models[capture], self.captures[capture]
         name = (candidate.kind, candidate.place) if candidate else ("", "")
         key = (*name, values.tobytes())
-        if key not in known:
-            if len(known) > MOST_ASKED:
-                known.clear()
-            out = known[key] = Changes(data.conditions)
+        if key not in cache:
+            if len(cache) > MOST_ASKED:
+                cache.clear()
+            changes = cache[key] = Changes(data.conditions)
             if candidate:
-                candidate.apply(out, model, values)
+                candidate.apply(changes, model, values)
             else:
                 for applied in model.effects:
                     if applied.scope == "instrument" or data.name in applied.captures:
-                        apply_to(out, model, applied)
-                out.shift_px = out.shift_px - self.own_px[capture] * data.pitch
-        return known[key]
+                        apply_to(changes, model, applied)
+                changes.shift_px = changes.shift_px - self.own_px[capture] * data.pitch
+        return cache[key]
 
     @property
     def held_out(self) -> str:
