@@ -110,12 +110,12 @@ class GeometryImage:
     ----------
     mask : (rows, columns), pixels that see a lit point of the object.
     points : geometry of those pixels, in row-major order, N = mask.sum().
-    seen : (rows, columns), pixels that see the object at all, its shadowed parts included.
+    visible : (rows, columns), pixels that see the object at all, its shadowed parts included.
     """
 
     mask: NDArray[np.bool_]
     points: ScatteringGeometry
-    seen: NDArray[np.bool_]
+    visible: NDArray[np.bool_]
 
     def fill(self, values: ArrayLike, outside: float = np.nan) -> NDArray[np.floating]:
         """Image (rows, columns, ...) of values (N, ...); `outside` elsewhere."""

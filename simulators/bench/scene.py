@@ -167,7 +167,7 @@ class Scene:
         surface = self._surface(spec, wavelength_nm)
         for block in _row_blocks(rows, columns):
             image = spec.geometry.at(omega_deg, rows, columns, block)
-            out[block][image.seen] = 0.0
+            out[block][image.visible] = 0.0
             if image.mask.any():
                 out[block][image.mask] = self._points(surface, image, wavelength_nm)
         return out

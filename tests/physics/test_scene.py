@@ -101,10 +101,10 @@ def test_the_shadowed_part_of_the_object_is_dark_before_a_bright_background(sphe
     spec = sphere.spec.model_copy(update={"background_m00": 0.2})
     m00 = Scene(spec, sphere.material).mueller_image(60, 662, 50, 50)[..., 0, 0]
     image = sphere.truth(60, 662, 50, 50).geometry
-    shadow = image.seen & ~image.mask
+    shadow = image.visible & ~image.mask
     assert shadow.sum() > 200
     assert np.all(m00[shadow] == 0)
-    np.testing.assert_allclose(m00[~image.seen], 0.2, rtol=1e-6)
+    np.testing.assert_allclose(m00[~image.visible], 0.2, rtol=1e-6)
 
 
 def test_rows_in_blocks_equal_the_image_at_once(sphere, monkeypatch):
