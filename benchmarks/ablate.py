@@ -1,4 +1,4 @@
-"""What each number of the diagnosis is worth: benches with many faults, judged with it halved and doubled.
+"""Effect of each number of the diagnosis: benches with many faults, judged with it halved and doubled.
 
     ./lab ablate                          every prior, price and cost
     ./lab ablate TAKES_PART PRICE         these alone

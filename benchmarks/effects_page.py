@@ -60,7 +60,7 @@ file hold them.
 
 @dataclass(frozen=True)
 class Described:
-    """What the docstring of an effect says."""
+    """The sections of the docstring of an effect."""
 
     kind: str
     title: str
@@ -147,7 +147,7 @@ def faulty_rig() -> str:
 
 
 def residual(effect: BenchEffect, scene: SceneImage, omega_deg: float) -> NDArray[np.float64]:
-    """What the declared model leaves of a capture with the effect (states, rows, columns), over the mean signal.
+    """Residual of the declared model for a capture with the effect (states, rows, columns), over the mean signal.
 
     The sphere is unknown, of air the Mueller matrix is known; outside the object it is zero.
     """

@@ -31,7 +31,7 @@ def fall_of(components: float) -> float:
 
 
 def blocks(components: float, random: np.random.Generator, draws: int = DRAWS) -> np.ndarray:
-    """Of independent noise in 15 directions, what the 8 of a block of three eigenvalues see: (draws, 8, 15)."""
+    """Projection of independent noise in 15 directions on the 8 of a block of three eigenvalues: (draws, 8, 15)."""
     directions = np.linalg.qr(random.normal(size=(draws, 15, 8)))[0]
     into = np.swapaxes(directions, 1, 2) * fall_of(components) ** (np.arange(15) / 2)
     return np.asarray(into / np.sqrt(np.square(into).sum(axis=(1, 2), keepdims=True) / 8))

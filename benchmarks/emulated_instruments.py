@@ -124,7 +124,7 @@ def _right(bench: Bench) -> Wrong:
     return angles, np.ones(len(next(iter(angles.values()))))
 
 
-#: Faults of the capture of air alone: what they change must not reach another sample.
+#: Faults of the capture of air alone: their effect must not reach another sample.
 OF_AIR = {"slips": _slips, "source": _smooth_source, "angles": _angles}
 
 

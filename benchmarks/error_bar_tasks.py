@@ -24,7 +24,7 @@ from processing.storage.products.product import Step
 PIXELS = 40_000
 #: Honest error bars may take this much longer.
 AT_MOST = 1.3
-#: Of a table: what is uncertain in the instrument, in degrees.
+#: Of a table: uncertain inputs of the instrument, in degrees.
 U = {
     **{f"{end}_retarder.retardance_deg": 0.3 for end in ("psg", "psa")},
     **{f"{end}.azimuth_deg": 0.1 for end in ("psg_retarder", "psa_retarder", "analyzer")},
@@ -71,7 +71,7 @@ def all_quantities() -> Task:
 
 
 def table(folder: Path) -> Task:
-    """`process table`, file to file: noise and five uncertain inputs of the instrument beside means and variances."""
+    """`process table`, file to file: noise and five uncertain inputs of the instrument, with means and variances."""
     write_frames(folder / "ball.h5", SMALL, frames_of_a_ball, omega_deg=35.0)
     model = InstrumentModel.load(INSTRUMENT).at(662).model_copy(update={"stderr": U})
     image = folder / "ball.mueller.h5"

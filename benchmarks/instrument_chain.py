@@ -42,7 +42,7 @@ class Row:
     nominal, train, written : rms difference from the reference, over the elements of M/m00 (S/S0) that the instrument
         determines, reduced with the file as it was, with the fitted values of the train alone, and as it was written.
     stated : rms of the standard errors in the product, noise and systematic.
-    reference : what it is compared with.
+    reference : name of the reference values.
     """
 
     name: str

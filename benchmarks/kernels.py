@@ -12,7 +12,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = ("tests/physics", "tests/measured", "tests/end_to_end/test_instrument_chain.py")
-#: What the processor must have for each kernel, by the names in /proc/cpuinfo.
+#: Features that the processor needs for each kernel, by the names in /proc/cpuinfo.
 NEEDS = {
     "Nehalem": {"sse4_2"},
     "Haswell": {"avx2", "fma"},

@@ -33,7 +33,7 @@ class Task:
     Attributes
     ----------
     target_ms : limit of the median; None where the limit is a ratio.
-    ours : does the work once; returns what it cost where only a part of it counts, or it is another process.
+    ours : does the work once; returns its cost where only a part of it counts, or it is another process.
     peers : seconds of one run of each, by name; a peer that is scaled up says so in its name.
     at_most : (peer, factor): ours must stay within that factor of that peer.
     rounds : how often at most, for tasks that take seconds.
@@ -57,7 +57,7 @@ def seconds(work: Callable[[], object]) -> float:
 
 
 def measure_cost(work: Callable[[], object]) -> Spent:
-    """What one call cost; what it says itself if it says so."""
+    """Cost of one call; the value that it returns if it measures itself."""
     wall, processor = time.perf_counter(), time.process_time()
     result = work()
     if isinstance(result, Spent):

@@ -15,7 +15,7 @@ from pathlib import Path
 from mutmut.stats import status_by_exit_code
 
 ROOT = Path(__file__).resolve().parents[1]
-#: What a changed program does when a test notices: fail, hang or crash.
+#: Outcomes of a changed program that a test notices: fail, hang or crash.
 NOTICED = ("killed", "timeout", "segfault", "suspicious")
 
 

@@ -94,7 +94,7 @@ def noisy_image(
 
     Parameters
     ----------
-    electrons : mean over the states of what an ideal depolarizer with m00 = 1 gives; one electron is one count.
+    electrons : mean over the states for an ideal depolarizer with m00 = 1; one electron is one count.
     darks : dark frames whose mean is subtracted; 0: the black is known.
     """
     w = rgb950() if w is None else w

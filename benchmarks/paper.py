@@ -1,4 +1,4 @@
-"""The paper in one command: simulate, acquire on emulators, process, and write one page beside the paper's numbers.
+"""The paper in one command: simulate, acquire on emulators, process, and write one page with the paper's numbers.
 
     ./lab paper [--work DIR] [--out paper.html]
 
@@ -27,7 +27,7 @@ from processing.campaign.executors import executor
 
 
 def run(work: Path, out: Path, size: Size, pool: Executor, *, figure: Path | None = None) -> None:
-    """Take what is missing, process it and write the page; products of an earlier run are found again.
+    """Take the missing captures, process them and write the page; products of an earlier run are used again.
 
     `figure`: file for the deviations against Omega.
     """
@@ -45,7 +45,7 @@ def run(work: Path, out: Path, size: Size, pool: Executor, *, figure: Path | Non
         seconds[f"captures of {part.name}"] = time.perf_counter() - part_begin
         return folder
 
-    # One camera is emulated at a time; what is taken is worked on while the next part is taken.
+    # One camera is emulated at a time; a finished part is processed while the next part is taken.
     with ThreadPoolExecutor(1) as bench:
         folders = [bench.submit(take_part, number) for number in range(3)]
         sphere = study_sphere(folders[0].result(), work / "results/sphere", pool, say)

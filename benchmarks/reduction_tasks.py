@@ -201,7 +201,7 @@ def reduce_file(folder: Path, target_ms: float) -> Task:
 
 
 def acquire(folder: Path) -> Task:
-    """A capture on the simulated rig, its motors at their true speed; what the states take beyond the unavoidable."""
+    """A capture on the simulated rig, its motors at their true speed; time of the states beyond the unavoidable."""
     out = folder / "acquired"
     program = Program([ROOT / "lab", "acquire", "--omega", "35", "--exposure", "0.1", "--out", out])
 

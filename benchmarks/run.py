@@ -1,4 +1,4 @@
-"""Speed of the hot paths beside what users have now, measured in turns in one run; medians and ratios.
+"""Speed of the hot paths compared with other programs, measured in turns in one run; medians and ratios.
 
 Run: ./lab bench [--repeats 7] [--peers PYTHON]
 Absolute times drift between machines and with other work on them, so every round measures ours and then each peer;

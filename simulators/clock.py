@@ -99,7 +99,7 @@ class FastClock:
     instant : bool
         Motions take no time at all; the clock itself runs on.
     base : drivers.clock.Clock
-        What the drivers that talk to this simulator count by; real time by default, for clients of any origin.
+        Clock of the drivers that talk to this simulator; real time by default, for clients of any origin.
     """
 
     def __init__(self, speed: float = 1.0, instant: bool = False, base: driver_clock.Clock = driver_clock.REAL) -> None:
@@ -121,7 +121,7 @@ class FastClock:
 
 
 class ManualClock(FastClock):
-    """A clock that only moves when it is told to, for tests that look at one instant."""
+    """A clock that only moves by `sleep_s`, for tests that look at one instant."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -9,7 +9,7 @@ from viewer.pages import fields_of, pages_of
 
 
 def alarms_now(request: Request) -> HTMLResponse:
-    """The part of a page that shows the alarms which nobody has acknowledged."""
+    """The part of a page that shows the alarms that are not acknowledged."""
     return pages_of(request).draw("alarms.html")
 
 

@@ -36,7 +36,7 @@ PLOTLY = STATIC / "plotly" / "plotly-cartesian-4.1.1.min.js"
 def application(folder: Path, token: str) -> Starlette:
     """The application for one folder; every address begins with the token.
 
-    Starlette runs endpoints that are plain functions in threads: a large read holds up nobody else.
+    Starlette runs endpoints that are plain functions in threads: a large read does not block other requests.
     """
     routes = [
         Route("/", browsing.browse),

@@ -23,7 +23,7 @@ from viewer.starting import campaign_files, resume_preview
 
 #: Files on one page of a list.
 MOST = 50
-#: What a list can be sorted by, as its columns are called; a minus turns the order round.
+#: Keys of sorting, with the names of the columns; a minus turns the order round.
 SORTS: dict[str, Callable[[Entry], Any]] = {
     "name": lambda e: natural(Path(e.name)),
     "sample": lambda e: e.sample,
@@ -70,7 +70,7 @@ class Listed:
 
         Parameters
         ----------
-        groups : what the list can be grouped by, and the group of a file; empty where it is in none.
+        groups : keys of grouping, each with the function that gives the group of a file; empty where it is in none.
         """
         query = dict(request.query_params)
         sort, group = query.get(f"{key}_sort", ""), query.get(f"{key}_group", "")

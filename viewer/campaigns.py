@@ -14,7 +14,7 @@ from acquisition.capture.writer import PARTIAL
 from processing.doors import MOST_JSON_BYTES, read_text
 from viewer.library import SATURATED, Entry, Library, NotHere
 
-#: States of a cell, with what each means; in the order of the legend.
+#: States of a cell with their meaning, in the order of the legend.
 STATUS = {
     "done": "complete",
     "flagged": "complete, with something to look at",
@@ -33,7 +33,7 @@ class Cell:
     ----------
     status : a key of `STATUS`.
     file : name of its file in the library; None where there is none yet.
-    told : what is to be said of it, in words.
+    told : remark, in words.
     """
 
     number: int
@@ -197,7 +197,7 @@ def _bars(events: list[dict[str, Any]]) -> Iterator[Bar]:
             yield Bar(*open_bar, when, {"complete": "done", "aborted": "partial"}.get(status, status))
             open_bar = None
         elif open_bar is not None and kind == "campaign started":
-            # What was killed has no end of its own.
+            # A killed run has no entry of its end.
             yield Bar(*open_bar, when, "failed")
             open_bar = None
     if open_bar is not None:
@@ -205,7 +205,7 @@ def _bars(events: list[dict[str, Any]]) -> Iterator[Bar]:
 
 
 def _match_grid(bar: Bar, cell: Cell | None, entry: Entry | None) -> Bar:
-    """The bar with what the log does not say: that a capture has a flag, or that its run was killed, and when."""
+    """The bar with facts that are not in the log: a flag of the capture, or the time at which its run was killed."""
     if cell is not None and (bar.status, cell.status) == ("done", "flagged"):
         return replace(bar, status="flagged")
     if bar.end is None and (cell is None or cell.status != "running"):
@@ -230,7 +230,7 @@ def seconds_left(view: CampaignView, run: dict[str, Any]) -> float | None:
 
     Parameters
     ----------
-    run : what the run says of itself (`acquisition.screen.run_file`).
+    run : state of the run (`acquisition.screen.run_file`).
     """
     left_s, pending, done = run.get("left_s"), run.get("pending") or 0, run.get("done") or 0
     durations_s = sorted(

@@ -136,7 +136,7 @@ def _ends(counts: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def product_values(product: Product, query: Any, window: Window) -> Measured:
-    """What a request chooses of a product in a window, with its standard errors, NaN where they are not known."""
+    """The map of a product that a request chooses, in a window, with its standard errors, NaN where unknown."""
     name, index = queried_map(product, query)
     if _is_derived(product, query):
         image = _image(product, window)
@@ -176,7 +176,7 @@ def _shared_errors(first: Product, second: Product, query: Any, window: Window) 
 
 
 def _systematic_errors(first: Product, second: Product, query: Any, window: Window) -> NDArray[np.floating]:
-    """What the instruments' uncertainties make of a difference, (rows, columns).
+    """Error of a difference by the instruments' uncertainties, (rows, columns).
 
     Products with the same uncertain inputs are of one instrument: its error leaves the difference as far as it moves
     both alike. Where only the size of both errors is known, they add.
@@ -188,7 +188,7 @@ def _systematic_errors(first: Product, second: Product, query: Any, window: Wind
 
 
 def _shifts(product: Product, query: Any, window: Window) -> tuple[NDArray[np.floating] | None, NDArray[np.floating]]:
-    """What each uncertain input of the instrument does to a map (D, rows, columns), if known, and their size."""
+    """Shifts of a map by each uncertain input of the instrument (D, rows, columns), if known, and their size."""
     name, index = queried_map(product, query)
     shifts = None
     if product.kind == "mueller" and (name == "mueller" or _is_derived(product, query)):

@@ -1,4 +1,4 @@
-"""Diagnoses started from the page: where their files are, what they say, and what was decided about them."""
+"""Diagnoses started from the page: their files, results and decisions."""
 
 import contextlib
 import json
@@ -41,7 +41,7 @@ VERDICTS = {
 
 @dataclass(frozen=True)
 class Story:
-    """One diagnosis with everything that a page tells of it."""
+    """One diagnosis with everything that a page shows of it."""
 
     name: str
     diagnosis: Diagnosis
@@ -68,7 +68,7 @@ class Story:
 
     @property
     def writes(self) -> bool:
-        """Whether a file could hold something of what was found."""
+        """Whether a file could hold a part of the correction."""
         return self.diagnosis.corrects
 
 
@@ -87,7 +87,7 @@ class Diagnoses:
         Parameters
         ----------
         instrument : its file; without one the model stored in the first capture is taken.
-        surface : files of the material and the geometry, where a surface is asked.
+        surface : files of the material and the geometry, for the diagnosis of a surface.
 
         Raises
         ------
@@ -198,7 +198,7 @@ class Diagnoses:
     def _decide(self, name: str, decision: dict[str, Any]) -> None:
         when = {"time": datetime.now().astimezone().isoformat(timespec="seconds")}
         path = self.folder(name) / "decision.json"
-        # The folder may be a colleague's: a link in its place is replaced, not written through.
+        # The folder may belong to another user: a link of that name is replaced, not written through.
         write_whole_text(path, json.dumps(decision | when), follow=False)
 
 

@@ -11,7 +11,7 @@ from starlette.responses import StreamingResponse
 
 #: Seconds between two looks.
 EVERY_S = 0.5
-#: Looks without a change after which a line is sent all the same, so that a page that has gone is noticed.
+#: Looks without a change after which a line is sent, so that a closed page is noticed.
 ALIVE_EVERY = 20
 
 

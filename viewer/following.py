@@ -20,7 +20,7 @@ from viewer.pages import fields_of, file_of, pages_of
 
 
 async def events(request: Request) -> StreamingResponse:
-    """Server-sent events: what the run in a folder does, whenever that has changed."""
+    """Server-sent events: the state of the run in a folder, whenever it has changed."""
     folder, library = file_of(request, "folder"), pages_of(request).library
 
     def look() -> dict[str, Any]:
@@ -33,7 +33,7 @@ async def events(request: Request) -> StreamingResponse:
 
 
 def run_state(folder: Path, library: Library) -> dict[str, Any]:
-    """What a page shows of a running campaign, or that none runs."""
+    """The state of a running campaign for a page, also that none runs."""
     run = running_in(folder)
     view = read_campaign(folder, library, None if run is None else run.get("capture"))
     state: dict[str, Any] = {"running": run is not None}

@@ -70,7 +70,7 @@ def comparable_files(entry: Entry, entries: list[Entry]) -> list[Entry]:
 
 
 def states_of(opened: Capture) -> dict[str, Any]:
-    """What a page has to know of the states done: roles, angles, exposures, limits of the scale."""
+    """The states done, for a page: roles, angles, exposures, limits of the scale."""
     detector = opened.header.detector
     top = saturation(opened)
     return {
@@ -111,7 +111,7 @@ def frame(request: Request) -> Response:
 
 
 def preview(request: Request) -> Response:
-    """A frame as a small picture (PNG): what is seen until the page's script has drawn the one that can be zoomed."""
+    """A frame as a small picture (PNG), shown until the page's script has drawn the one that can be zoomed."""
     path, query = file_of(request), request.query_params
     with Capture(path) as record:
         state, channel = chosen_frame(record, query)

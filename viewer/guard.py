@@ -1,4 +1,4 @@
-"""Who may come in: browsers on this machine that were given the address with its token, and no page of another site."""
+"""Access control: browsers on this machine that have the address with its token, and no page of another site."""
 
 import secrets
 

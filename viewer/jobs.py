@@ -1,4 +1,4 @@
-"""What the application starts: the commands of the console, each in a process of its own that outlives the page.
+"""Jobs of the application: commands of the console, each in a process that outlives the page.
 
 Every button runs a command that could be typed as well, and the page shows it. Output and exit code are kept in a
 hidden folder beside the data, so that every tab sees them, and a later start of the application too.
@@ -44,7 +44,7 @@ class PageJob:
     ----------
     name : of its folder.
     command : as it could be typed.
-    about : what it is for: names of files by what they are ("capture", "campaign", "diagnosis").
+    about : names of the files it works on, by kind ("capture", "campaign", "diagnosis").
     """
 
     name: str
@@ -137,7 +137,7 @@ class Jobs:
         return None
 
     def status(self, job: PageJob) -> str:
-        """running, done, stopped, failed or ended, which is: nobody was there to see how."""
+        """running, done, stopped, failed, or ended, which means that the exit code is unknown."""
         if self.running(job):
             return "running"
         code = self.code(job)
@@ -146,7 +146,7 @@ class Jobs:
         return {0: "done", 130: "stopped"}.get(code, "failed")
 
     def output(self, job: PageJob) -> str:
-        """What it has said, the end of it; of a bar that is redrawn the last state."""
+        """The end of its output; of a progress bar the last state."""
         try:
             text = (self._folder / job.name / "output.txt").read_text(encoding="utf-8", errors="replace")
         except OSError:

@@ -1,4 +1,4 @@
-"""The light of the lamp through a capture, told from what polarization does to the mean of a frame.
+"""The light of the lamp through a capture, separated from the effect of polarization on the mean of a frame.
 
 The mean of a frame, dark subtracted, is linear in the mean Mueller matrix of the scene: sixteen numbers explain it in
 every state, and what is left over, in parts of the fit, is the lamp. States that repeat the first pose see the same
@@ -15,14 +15,14 @@ from processing.reduction.effects_of_capture import capture_changes
 from processing.reduction.measurement_matrix import angles_of
 from processing.storage.captures.capture import Capture
 
-#: Leverage beyond which the other states say too little of one: the noise of its lamp would be ten times its own.
+#: Leverage above which the other states do not determine one: the noise of its lamp would be ten times its own.
 TELLING = 0.9
 #: States more than unknowns before a fit tells anything.
 SPARE = 4
 
 
 def lamp(capture: Capture) -> dict[str, Any]:
-    """Light of each light state over what it should be: states, ratio, and how it was told."""
+    """Ratio of measured to expected light of each light state: states, ratio, and the method in words."""
     light = np.flatnonzero([role != "dark" for role in capture.role])
     if not light.size:
         return {"states": [], "ratio": [], "told": "no light state is done yet"}
@@ -85,7 +85,7 @@ def _fitted(capture: Capture, light: NDArray[np.int64], signal: NDArray[np.float
 def _predict_from_others(
     w: NDArray[np.float64], signal: NDArray[np.float64], valid: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """What the other states make of each one: a fit with all of them would follow a flash halfway."""
+    """Prediction of each state by the others: a fit with all of them would follow a flash halfway."""
     u, s, _ = np.linalg.svd(w[valid], full_matrices=False)
     u = u[:, s > 1e-8 * s[0]]
     leverage = np.square(u).sum(axis=1)

@@ -1,4 +1,4 @@
-"""What lies in the folder: captures, products, tables and campaigns, and what was made from what."""
+"""Files of the folder: captures, products, tables and campaigns, with their inputs and products."""
 
 import json
 import os
@@ -23,7 +23,7 @@ from processing.whole_file import write_whole_text
 SATURATED = 0.001
 #: Where the application keeps its own files; a hidden folder is never looked into.
 OWN = ".umov-view"
-#: What is known of every file, in the folder above; written after so many files were read anew.
+#: Index of every file, in the folder above; written after so many files were read anew.
 INDEX, READ_ANEW = "index.json", 50
 #: Parts of a header that no list shows.
 LONG = {"instrument_yaml", "plan_yaml", "rig_yaml", "camera_settings_json", "devices_json", "versions"}
@@ -42,9 +42,9 @@ class Entry:
     name : path from the folder on, with forward slashes.
     kind : "capture", "table", the kind of a product, or "unreadable".
     status : of a capture; "complete" for what has none.
-    flags : what somebody should look at, in words.
+    flags : problems to look at, in words.
     inputs : identities of the files that it was made from, as the provenance keeps them.
-    content : what the file is known by in the provenance of others: `made_of` of a product.
+    content : identifies the file in the provenance of other files: `made_of` of a product.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Entry:
 
     @property
     def title(self) -> str:
-        """What the header calls it, or the file's name."""
+        """The title in the header, or the file's name."""
         return self.header.title if self.header is not None else Path(self.name).name
 
     @property
@@ -73,7 +73,7 @@ class Entry:
 
     @property
     def words(self) -> str:
-        """What a search looks through, in small letters."""
+        """The text that a search looks through, in small letters."""
         parts = [self.name, self.kind, self.status, self.step, *self.flags]
         if self.header is not None:
             header = self.header
@@ -96,7 +96,7 @@ class Library:
         self._load_index()
 
     def path(self, name: str) -> Path:
-        """The file or folder of that name. Raises NotHere for what is not there, or not inside the folder."""
+        """The file or folder of that name. Raises NotHere if there is none, or it is outside the folder."""
         try:
             path = (self.root / name).resolve()
             if path.is_relative_to(self.root) and path.exists():
@@ -111,7 +111,7 @@ class Library:
         return path.resolve().relative_to(self.root).as_posix()
 
     def holds(self, path: Path) -> bool:
-        """Whether there is a file of that path and it lies in the folder; a link is what it leads to."""
+        """Whether there is a file of that path and it lies in the folder; links are followed."""
         return path.is_file() and path.resolve().is_relative_to(self.root)
 
     def entries(self) -> list[Entry]:
@@ -146,7 +146,7 @@ class Library:
         return paths
 
     def _load_index(self) -> None:
-        """What an earlier run knew; nothing of a damaged index, or of another version of this program."""
+        """Load the index of an earlier run; none if it is damaged, or from another version of this program."""
         try:
             index = json.loads((self.root / OWN / INDEX).read_text(encoding="utf-8"))
             for name, (stamp, facts) in index["files"].items() if index["program"] == program() else ():
@@ -167,7 +167,7 @@ class Library:
             (self.root / OWN).mkdir(exist_ok=True)
             write_whole_text(self.root / OWN / INDEX, json.dumps({"program": program(), "files": files}))
         except (OSError, ValueError):
-            # A folder that nobody may write, or a name that is not UTF-8: the files are read again next time.
+            # A read-only folder, or a name that is not UTF-8: the files are read again next time.
             pass
         self._read_anew = 0
 
@@ -260,7 +260,7 @@ def inputs_of(entry: Entry, entries: list[Entry], root: Path) -> list[tuple[str,
 
 
 def input_of(identity: dict[str, Any], entries: list[Entry], root: Path) -> Entry | None:
-    """The file in the folder that an input was: by what it was made of, by its path, or moved with its folder."""
+    """The file in the folder that an input was: by its content, by its path, or moved with its folder."""
     path, content = str(identity.get("path", "")), identity.get(MADE_OF)
     if content is not None and (match := next((e for e in entries if e.content == content), None)):
         return match

@@ -23,14 +23,14 @@ _lock = threading.Lock()
 
 
 class Note(Section):
-    """What somebody wrote about a file."""
+    """Note and tags of a file."""
 
     text: str = ""
     tags: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
-        """What a search looks through, in small letters."""
+        """The text that a search looks through, in small letters."""
         return " ".join((self.text, *self.tags)).lower()
 
 

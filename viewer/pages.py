@@ -1,4 +1,4 @@
-"""What every page needs: the templates, the library, and where a file of the folder is shown."""
+"""Shared by all pages: the templates, the library, and the page of a file of the folder."""
 
 import os
 import time
@@ -57,7 +57,7 @@ class Pages:
         return HTMLResponse(text.encode(errors="replace"), code)
 
     def address(self, what: str, **query: object) -> str:
-        """Address of a page or a picture, with what it is asked."""
+        """Address of a page or a picture, with its query."""
         parameters = urlencode({key: v for key, v in query.items() if v is not None}, errors="surrogateescape")
         return f"{self.root}/{what}" + (f"?{parameters}" if parameters else "")
 

@@ -11,7 +11,7 @@ from starlette.responses import Response
 
 from processing.errors import ProcessError
 
-#: Most pixels along a side of what is sent at once.
+#: Most pixels along a side of one picture.
 MOST = 1024
 
 
@@ -48,7 +48,7 @@ class Window:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns) of what is sent."""
+        """(rows, columns) of the picture that is sent."""
         return (
             -(-(self.rows.stop - self.rows.start) // self.step),
             -(-(self.columns.stop - self.columns.start) // self.step),

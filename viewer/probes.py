@@ -1,4 +1,4 @@
-"""Answers to what a page asks of a pixel or a region."""
+"""Answers to requests of a page about a pixel or a region."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -41,7 +41,7 @@ def _capture_probe(path: Path, query: Any) -> dict[str, Any]:
 
 
 def matrix_of(request: Request) -> JSONResponse:
-    """Mueller matrix of a pixel or a region of a capture, and what it decomposes into."""
+    """Mueller matrix of a pixel or a region of a capture, and its decompositions."""
     path = file_of(request)
     with Capture(path) as capture:
         region = Region.parse(request.query_params, capture.frame_shape)
@@ -82,7 +82,7 @@ def _make_reducer(path: Path, instrument: Path | None, changed: tuple[int, ...])
 
 
 def of_product(request: Request) -> JSONResponse:
-    """What a product says of a pixel or a region, and the intensities behind it where the capture is at hand."""
+    """Values of a product at a pixel or a region, and its intensities if the capture is in the folder."""
     return JSONResponse(_product_probe(file_of(request), request.query_params, pages_of(request).library))
 
 
@@ -114,7 +114,7 @@ def _product_probe(path: Path, query: Any, library: Library) -> dict[str, Any]:
 def _planes(product: Product, region: Region) -> list[dict[str, Any]]:
     entries, correlation = [], neighbour_correlation(product)
     for name in product.names:
-        # The flags are told in words.
+        # The flags are given in words.
         if name.endswith((*COMPANIONS, "covariance")) or name in ("mueller", "pixel_flags"):
             continue
         values = product.get(name, region.rows)[..., region.columns]

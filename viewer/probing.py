@@ -1,4 +1,4 @@
-"""A pixel or a region looked at closely: intensities with the fitted curve, Mueller matrix, what it decomposes into."""
+"""Details of a pixel or a region: intensities with the fitted curve, Mueller matrix and its decompositions."""
 
 import math
 from collections.abc import Sequence
@@ -158,7 +158,7 @@ def curve(reducer: PixelReducer, region: Region) -> dict[str, Any]:
 
 
 def matrix(image: MuellerImage | ExtrapolatedImage) -> dict[str, Any]:
-    """Mueller matrix over m00 with its standard errors, and what it decomposes into."""
+    """Mueller matrix over m00 with its standard errors, and its decompositions."""
     measured = (image.is_determined if isinstance(image, MuellerImage) else np.ones(16, dtype=bool)).reshape(4, 4)
     m, errors = (np.where(measured, v.reshape(4, 4), np.nan).astype(float) for v in (image.values, image.errors))
     derived = quantities_block(image, (), {}) if measured.all() else {}
@@ -188,7 +188,7 @@ def matrix(image: MuellerImage | ExtrapolatedImage) -> dict[str, Any]:
 
 
 def finite(values: Any) -> Any:
-    """Plain numbers for JSON; None for what is not finite."""
+    """Plain numbers for JSON; None for values that are not finite."""
     array = np.asarray(values, dtype=float)
     if array.ndim == 0:
         return float(array) if np.isfinite(array) else None

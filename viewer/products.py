@@ -87,7 +87,7 @@ def maps_of(opened: Product) -> list[dict[str, Any]]:
 
 
 def choices_of(product: Product) -> list[dict[str, Any]]:
-    """What a product can be asked for: elements over m00, its maps, quantities of a whole M."""
+    """Choices of a product: elements over m00, its maps, quantities of a whole M."""
     choices = maps_of(product)
     if is_stokes_vector(product):
         elements = [{"label": f"S{k} over S0", "name": "mueller", "index": 4 * k} for k in range(1, 4)]

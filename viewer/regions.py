@@ -1,4 +1,4 @@
-"""Named regions of the images of a folder, and what an image says of each of them."""
+"""Named regions of the images of a folder, and the values of an image in each of them."""
 
 import csv
 import io
@@ -256,7 +256,7 @@ def _means(path: Path, changed: int, place: tuple[int, int, int, int]) -> dict[s
 
 
 def _mean(values: NDArray[np.float64], period: float | None, axis: int) -> NDArray[np.float64]:
-    """Mean along an axis of what is finite; of orientations, that of 1 and 179 degrees is 0 and not 90."""
+    """Mean of the finite values along an axis; of orientations, that of 1 and 179 degrees is 0 and not 90."""
     is_finite = np.isfinite(values)
     filled = np.where(is_finite, values, 0)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -29,7 +29,7 @@ def serve(folder: Path, port: int, browser: bool) -> None:
     typer.echo(f"view: {address}")
     typer.echo("Ctrl-C ends it; runs started from the page continue.", err=True)
     sys.stdout.flush()
-    # A browser that never asks holds a connection; those who ask must find one more.
+    # A browser that sends no request holds a connection; other requests need one more.
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (limit if limit != resource.RLIM_INFINITY else 1 << 16, limit))
     way_in = _open_in_browser(address) if browser else None

@@ -1,4 +1,4 @@
-"""Files that the application keeps beside the data, in the folder of its own: read and written as a whole."""
+"""Files of the application next to the data, in a hidden folder: read and written as a whole."""
 
 from typing import TypeVar
 
@@ -13,7 +13,7 @@ Kept = TypeVar("Kept", bound=BaseModel)
 
 
 def read_side_file(library: Library, file: str, kind: type[Kept]) -> Kept:
-    """What a file holds; empty where there is none. Raises ProcessError for a damaged file."""
+    """Content of a file; empty where there is none. Raises ProcessError for a damaged file."""
     path = library.root / OWN / file
     if not path.exists():
         return kind()

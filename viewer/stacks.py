@@ -21,7 +21,7 @@ from viewer.probing import Region
 from viewer.products import choices_of
 from viewer.regions import MeasuredImage, load_regions
 
-#: What a curve runs over: the name of a column, and what it is.
+#: Abscissas of a curve: the name of a column, and its label.
 AXES = {"omega": "Ω", "nm": "wavelength", "time": "time", "sample": "sample"}
 #: Products of one stack at most.
 MOST_FILES = 1000

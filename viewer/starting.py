@@ -1,4 +1,4 @@
-"""What a page starts: a campaign, a reduction, the maps of a product, a diagnosis; and how far each has come."""
+"""Jobs that a page starts: a campaign, a reduction, the maps of a product, a diagnosis; and their progress."""
 
 import shlex
 from collections.abc import Callable
@@ -31,7 +31,7 @@ def jobs_of(request: Request) -> Jobs:
 
 
 async def start(request: Request) -> JSONResponse:
-    """Start what the page asks for; answers with the address of the page that follows it."""
+    """Start the job that the page requests; answers with the address of the page that follows it."""
     fields = await fields_of(request)
     pages = pages_of(request)
     kind = fields.get("what", "")
@@ -92,7 +92,7 @@ def resume_command(folder: Path) -> list[str] | None:
 
 
 def resume_preview(folder: Path) -> tuple[str, list[str]] | None:
-    """What a page would run to resume the campaign in a folder, as typed, and the commands that its rig file names.
+    """The command that resumes the campaign in a folder, as typed, and the commands that its rig file names.
 
     None where the campaign is not the user's own.
     """
@@ -210,7 +210,7 @@ def _simulated(pages: Pages, page_job: PageJob) -> bool:
 
 
 def job_state(pages: Pages, jobs: Jobs, page_job: PageJob) -> dict[str, Any]:
-    """What a page shows of a job: status, output, and where what it makes is shown."""
+    """State of a job for its page: status, output, and links to its products."""
     status = jobs.status(page_job)
     links = []
     about, library = page_job.about, pages.library

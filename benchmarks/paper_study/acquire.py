@@ -14,7 +14,7 @@ CONFIGS = ROOT / "configs"
 BENCH = Path(__file__).parent / "bench"
 #: Where the paper shows its images.
 SHOWN_DEG = 35.0
-#: What nobody tells the processing in the second part: the generator's plate was remounted, 2 degrees off.
+#: Undeclared fault of the second part: the generator's plate was remounted, 2 degrees off.
 FAULT = {"kind": "element_error", "element": "psg_retarder", "parameter": "azimuth_deg", "offset": 2.0}
 
 
@@ -49,12 +49,12 @@ class Part:
     modes: tuple[str, ...]
     omega_deg: tuple[float, ...]
     effects: tuple[Mapping[str, Any], ...] = ()
-    #: Air is taken first: a known sample, without which nobody sees what is wrong with a plate.
+    #: Air is taken first: only a known sample shows a fault of a plate.
     air: bool = False
 
 
 def parts(size: Size) -> tuple[Part, ...]:
-    """The sphere at all angles, the body, and the sphere again after somebody remounted a plate."""
+    """The sphere at all angles, the body, and the sphere again after a plate was remounted."""
     modes = ("drr", "stokes")
     return (
         Part("sphere", "sphere", modes, size.omega_deg),
@@ -64,7 +64,7 @@ def parts(size: Size) -> tuple[Part, ...]:
 
 
 def take_captures(work: Path, size: Size, part: Part) -> Path:
-    """Take what is missing of a part of the study; returns the folder of its captures."""
+    """Take the missing captures of a part of the study; returns their folder."""
     folder = work / part.name
     folder.mkdir(parents=True, exist_ok=True)
     for mode in part.modes:

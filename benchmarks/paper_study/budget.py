@@ -1,4 +1,4 @@
-"""What makes the deviations, told apart: noise, registration, the constants of the material, and the rest.
+"""Contributions to the deviations: noise, registration, the constants of the material, and the remainder.
 
 Contributions add as squares where they are independent. The noise is what the error bars of the captures predict; each
 other one is by how much the square of the deviation falls when its cause is taken away: the sphere found in the images

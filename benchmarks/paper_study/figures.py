@@ -31,7 +31,7 @@ NO_ORIENTATION = 0.01
 
 
 class Shown(NamedTuple):
-    """A figure and what it shows."""
+    """A figure and its caption."""
 
     figure: Figure
     caption: str

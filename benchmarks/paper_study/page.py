@@ -1,4 +1,4 @@
-"""The study as one page: the paper's numbers beside ours, figure by figure."""
+"""The study as one page: the paper's numbers next to ours, figure by figure."""
 
 from collections.abc import Sequence
 from datetime import UTC, datetime

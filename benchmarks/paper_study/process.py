@@ -1,4 +1,4 @@
-"""What the study makes of its captures, with the same steps as the commands of `process` and `diagnose`."""
+"""Processing of the study's captures, with the same steps as the commands of `process` and `diagnose`."""
 
 import os
 import shutil
@@ -25,7 +25,7 @@ from processing.yaml_file import dump_yaml
 
 SPHERE, BODY = CONFIGS / "geometries/one_inch_sphere.yaml", Path(__file__).parent / "body_geometry.yaml"
 TABLE_I, RGB950 = CONFIGS / "materials/red_print.yaml", CONFIGS / "instruments/rgb950.yaml"
-#: What the bench has; only the budget and the page look at it, to say what is the model's part.
+#: The true material of the bench; only the budget and the page use it, to separate the model's part.
 TRUE_MATERIAL = BENCH / "material.yaml"
 #: Arm angles of which at most so many go into a fit of the material, evenly chosen.
 FITTED_ANGLES = 4
@@ -50,7 +50,7 @@ class SphereStudy:
 
 @dataclass(frozen=True)
 class BodyProducts:
-    """The body at one wavelength: what the Mueller polarimeter measured, and what the Stokes camera's image gives."""
+    """The body at one wavelength: products of the Mueller polarimeter and of the Stokes camera."""
 
     mueller: Path
     quantities: Path
@@ -61,7 +61,7 @@ class BodyProducts:
 
 @dataclass(frozen=True)
 class FaultStudy:
-    """The same fault before and after `diagnose`: Mueller results, xi0 against the Stokes camera, what was found."""
+    """The same fault before and after `diagnose`: Mueller results, xi0 against the Stokes camera, the diagnosis."""
 
     before: CampaignResult
     after: CampaignResult

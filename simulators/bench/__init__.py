@@ -1,1 +1,1 @@
-"""The optical bench: scene, optics, what they do undeclared; angles in, counts out."""
+"""The optical bench: scene, optics and undeclared effects; angles in, counts out."""

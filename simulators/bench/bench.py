@@ -21,7 +21,7 @@ from simulators.bench.effects.base import BenchEffect, Shot
 DETECTOR = Detector(black_level_counts=64.0, gain_e_per_count=2.6, read_noise_e=2.3, full_well_e=10_500.0, bits=12)
 DARK_CURRENT_E_PER_S = 2.0
 BLOCK_PIXELS = 1 << 16
-#: From one exposure to the next where nobody says when they are.
+#: From one exposure to the next where no times are given.
 STATE_PERIOD_S = 1.0
 
 
@@ -125,7 +125,7 @@ class SimulatedBench:
         ----------
         angles_deg : true angle of each axis that the instrument names, degrees.
         index : number of the exposure; it seeds the noise.
-        light : what the source gives of its nominal light; 0 with the shutter closed.
+        light : of the source, as a fraction of its nominal light; 0 with the shutter closed.
         omega_deg : true angle of the arm, unless `angles_deg` has "arm".
         time_s : when it is, for effects that change with time; default: `STATE_PERIOD_S` from one index to the next.
 

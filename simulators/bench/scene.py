@@ -90,13 +90,13 @@ class _SceneFile(RootModel[AnyScene]):
 
 @dataclass(frozen=True)
 class SceneTruth:
-    """What a measurement should find.
+    """The true result of a measurement.
 
     Attributes
     ----------
     xi0, m00 : (rows, columns), NaN outside the mask.
     mask : (rows, columns), pixels that see a lit point of the sample.
-    geometry : of those pixels; None for what is no object.
+    geometry : of those pixels; None without an object.
     """
 
     xi0: RealArray

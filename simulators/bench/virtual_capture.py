@@ -32,7 +32,7 @@ def write_virtual_capture(
     bench : SimulatedBench
         With its scene, true optics and wavelength.
     instrument : InstrumentModel
-        The model declared in the file, all wavelengths; with a mosaic, every state is alike.
+        The model declared in the file, all wavelengths; with a mosaic, all states are equal.
     omega_deg : float
         Angle of the arm.
     exposure_s : float

@@ -1,1 +1,1 @@
-"""Captures with undeclared faults, their truth apart, and the judge of what `diagnose` says of them."""
+"""Captures with undeclared faults, their truth in another folder, and the judge of the answers of `diagnose`."""

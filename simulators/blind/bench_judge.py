@@ -13,7 +13,7 @@ Result = Mapping[str, Any]
 GIVEN: dict[str, tuple[str, ...]] = {"joint": FITTED, **{name: (name,) for name in FITTED}}
 #: Mistakes of wiring that are a wrong ratio.
 TURNED_OTHERWISE = ("psg_reversed", "psa_reversed", "both_reversed", "ratio", "half_degrees", "double_degrees")
-#: What a sentence about a mistake of wiring has to say.
+#: Words that a sentence about a mistake of wiring must have.
 WIRING_WORDS = {
     "psg_reversed": "axis 'psg' turns the other way",
     "psa_reversed": "axis 'psa' turns the other way",
@@ -65,7 +65,7 @@ class TrueCause:
 
 @dataclass(frozen=True)
 class Matter:
-    """A true fault, how much it matters (see `TrueFault`), and how it was told: "named", "in a set" or "missed"."""
+    """A true fault, its size (see `TrueFault`), and its outcome: "named", "in a set" or "missed"."""
 
     label: str
     size: float
@@ -171,7 +171,7 @@ def _names(text: str, capture: str | None, fault: TrueFault) -> bool:
 
 
 def matters_of(result: Result, truth: RealBench, captures: Sequence[str]) -> tuple[Matter, ...]:
-    """Of each fault that acts in the captures given: how much it matters, and how it was told."""
+    """Size and outcome of each fault that acts in the captures."""
     out = []
     for fault in active(truth, captures):
         size = max((v for c, v in fault.matters.items() if c in (*captures, VALIDATION)), default=0.0)
@@ -190,7 +190,7 @@ def matters_of(result: Result, truth: RealBench, captures: Sequence[str]) -> tup
 
 
 def wiring_of(result: Result, truth: RealBench) -> tuple[TrueCause, ...]:
-    """The mistake of wiring that is told, against the truth."""
+    """The mistake of wiring that was reported, compared with the truth."""
     text = result.get("wiring")
     if not text:
         return ()

@@ -49,7 +49,7 @@ def fit_of_the_truth(
 
 
 def read_oracle(folder: Path, truth: RealBench, configs: Path, capture_set: str) -> float:
-    """Error of M / m00 of the validation sample after a fit of the true set; kept beside the truth once it is known."""
+    """Error of M / m00 of the validation sample after a fit of the true set; cached next to the truth."""
     base = folder / "truth" / truth.name
     cache = base / f"oracle_{capture_set}.json"
     if cache.exists():

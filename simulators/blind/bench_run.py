@@ -1,4 +1,4 @@
-"""Diagnose one bench of `real_bench`, apply what was written to captures that no fit saw, and judge it."""
+"""Diagnose one bench of `real_bench`, apply the correction to captures that no fit has used, and judge it."""
 
 import json
 import time

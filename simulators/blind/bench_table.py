@@ -10,7 +10,7 @@ from simulators.blind.bench_judge import BenchJudgement, TrueCause
 
 #: Errors of M / m00 below this are the rounding of counts, not the instrument.
 FLOOR = 2e-5
-#: An error of M counts as reached up to this many times that of the fit with the true set; the second is told as well.
+#: An error of M counts as reached up to this many times that of the fit with the true set; the second is listed too.
 REACHED, NEARLY = 1.2, 2.0
 #: A fault matters from so many standard errors of M on.
 MATTERS = 1.0
@@ -20,7 +20,7 @@ BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.97, 0.99, 1.0)
 
 @dataclass(frozen=True)
 class Bin:
-    """Causes that were told with a probability in a range: how many, their mean probability, how many are true."""
+    """Causes reported with a probability in a range: their number, mean probability, and true share."""
 
     low: float
     high: float
@@ -40,7 +40,7 @@ def sure_and_wrong(j: BenchJudgement) -> list[TrueCause]:
 
 
 def reliability(judgements: Sequence[BenchJudgement]) -> list[Bin]:
-    """Told against true, by probability; a cause is true if it or another of its set is there."""
+    """Reported against true causes, by probability; a cause is true if it or another of its set is present."""
     causes = [c for j in judgements for c in j.causes if c.certainty != "unknown"]
     p = np.array([c.probability for c in causes])
     true = np.array([c.right_set for c in causes], dtype=float)

@@ -1,4 +1,4 @@
-"""Captures whose detector is not what is declared, or whose frames and pixels are not all good; the optics are right.
+"""Captures whose detector differs from the declared one, or with bad frames or pixels; the optics are right.
 
 `diagnose` may say that the noise is not as declared, and leave frames and pixels out; any name of an optical cause is
 wrong.
@@ -19,7 +19,7 @@ def read_noise_doubled(bench: TrueBench, random: np.random.Generator, states: in
 
 
 def row_noise(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
-    """Every row of every frame has an offset of its own, 3 electrons rms."""
+    """Every row of every frame has another offset, 3 electrons rms."""
     bench.noise.append(lambda e, r: e + 3.0 * r.standard_normal((*e.shape[:2], 1)))
     return Truth("row_noise")
 
@@ -53,7 +53,7 @@ def gain_not_stated(bench: TrueBench, random: np.random.Generator, states: int) 
 
 
 def resampled(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
-    """Images were moved by a part of a pixel before they were stored: the noise of neighbours is alike."""
+    """Images were moved by a part of a pixel before they were stored: the noise of neighbours is correlated."""
     x, y = random.uniform(0.3, 0.7, 2)
 
     def move(counts: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What a bench in a lab has wrong, how often and how much: the distribution that real benches are drawn from.
+"""Faults of a bench in a lab, their frequencies and sizes: the distribution that real benches are drawn from.
 
 Sizes are what is left after an ordinary calibration of an ordinary bench, drawn evenly in the logarithm between the
 two numbers, with a random sign where the fault has one. docs/studies/real-benches.md has them with

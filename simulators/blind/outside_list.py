@@ -1,6 +1,6 @@
 """More faults that `processing/instrument/effects` does not know, by physics, at sizes of a lab.
 
-The first nine are in `undeclared_faults.UNLISTED`. Each changes a TrueBench and says what it did.
+The first nine are in `undeclared_faults.UNLISTED`. Each changes a TrueBench and returns the truth.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ def _spot(bench: TrueBench, random: np.random.Generator, low: float, high: float
 
 
 def drifting_spot(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
-    """A part of the sample is lit by a lamp of its own, which drifts."""
+    """A part of the sample is lit by another lamp, which drifts."""
     y, x = _grid(bench)
     y0, x0, radius = _spot(bench, random, 0.1, 0.3)
     spot = np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / (2 * radius**2))
@@ -104,7 +104,7 @@ def turning_shadow(bench: TrueBench, random: np.random.Generator, states: int) -
 
 
 def rolling_rows(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
-    """Rows are exposed one after the other under a lamp that ripples, and the ripple is not in step with the frames."""
+    """Rows are exposed one after another under a lamp whose ripple is not synchronous with the frames."""
     size, periods = draw_size(random, 0.003, 0.02), random.uniform(1.3, 5)
     phase = random.uniform(0, 2 * np.pi, states)
     rows = 2 * np.pi * periods * np.linspace(0, 1, bench.rows)[:, None]

@@ -44,7 +44,7 @@ MOSAIC_NM = 662.0
 PIXELS = 64
 FITTED = ("sphere", "flat", "air")
 VALIDATION = "validation"
-#: Each capture has these of its own; the others belong to the bench.
+#: Faults that each capture draws anew; the others belong to the bench.
 OF_THE_CAPTURE = frozenset(
     {
         *("source_drift", "source_flicker", "image_drift", "retardance_drift", "rotation_slip", "angle_per_state"),
@@ -149,7 +149,7 @@ class _Draw:
 
     def apply(self, bench: TrueBench, capture: str) -> TrueFault | None:
         is_local = self.kind in OF_THE_CAPTURE
-        # Another sample is measured later: what is a capture's own is not known of it, and does not act in it.
+        # Another sample is measured later: a fault of one capture does not act in it.
         if is_local and (capture == VALIDATION or (self.kind in ONCE and capture != self.once)):
             return None
         bench.axis = self.axis
@@ -256,7 +256,7 @@ class _Taken:
     angles: dict[str, Array]
 
     def exposed(self, without: int | None = None) -> tuple[TrueBench, Array, dict[int, TrueFault]]:
-        """The bench, electrons (N, rows, columns) without noise, and what was done to it."""
+        """The bench, electrons (N, rows, columns) without noise, and its faults."""
         bench = self.sound()
         done = {i: d.apply(bench, self.capture) for i, d in enumerate(self.draws) if i != without}
         return bench, expose(bench, self.scene, self.angles), {i: f for i, f in done.items() if f is not None}

@@ -1,4 +1,4 @@
-"""Reliability diagram: of causes that were told with a probability, how many are true."""
+"""Reliability diagram: the true share of the causes, against their reported probability."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from simulators.blind.bench_table import reliability
 
 
 def draw(judgements: Sequence[BenchJudgement], path: Path) -> None:
-    """Write the diagram; bars are one standard error of a share (Wilson's interval), numbers are the causes told."""
+    """Write the diagram; bars are one standard error of a share (Wilson's interval), numbers count the causes."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.5, 4.5), layout="constrained")
@@ -23,7 +23,7 @@ def draw(judgements: Sequence[BenchJudgement], path: Path) -> None:
         axes.errorbar(b.told, middle, yerr=half, marker="o", color="C0", capsize=3)
         lowest = min(lowest, b.told, middle - half)
         axes.annotate(f"{n} ", (b.told, middle - half), ha="right", va="top", fontsize=8)
-    # What is told is rarely less likely than nine in ten: an axis from zero would show one corner alone.
+    # Reported causes rarely are less likely than nine in ten: an axis from zero would show one corner alone.
     least, room = np.floor(20 * lowest - 1) / 20, 0.02 * (1 - lowest)
     axes.set(xlabel="probability told", ylabel="share that is true", aspect="equal")
     axes.set(xlim=(least, 1 + room), ylim=(least, 1 + room))

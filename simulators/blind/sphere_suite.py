@@ -1,4 +1,4 @@
-"""Captures of a sphere with one thing wrong that the processing is not told: for tests and for the blind suite."""
+"""Captures of a sphere with one undeclared fault: for tests and for the blind suite."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -32,12 +32,12 @@ UNLISTED = ("not_degenerate", "dented", "second_lamp", "slow_turn", "wet_patch",
 
 @dataclass(frozen=True)
 class SphereFault:
-    """What is wrong, and what makes it so.
+    """A fault, with the scene and the instrument that have it.
 
     Attributes
     ----------
     kind : name of the case; parts of two at once are joined with "+".
-    scene, instrument : what is true; material : what the processing believes.
+    scene, instrument : the truth; material : the one declared to the processing.
     parameters : true values by kind of effect, in the units of the effect; empty where it has no counterpart.
     """
 

@@ -93,7 +93,7 @@ class TrueBench:
     stored: list[Callable[[Array], Array]] = field(default_factory=list)
     #: (true angles in degrees) -> angles as the capture file has them.
     recorded: list[Callable[[dict[str, Array]], dict[str, Array]]] = field(default_factory=list)
-    #: What the capture file says of the detector, where it is not the truth.
+    #: Detector as declared in the capture file, where it is not the true one.
     declared: dict[str, float | None] = field(default_factory=dict)
     #: (N,) when each state was taken, by the camera's clock; default: evenly. And how late the host stamped it.
     times_s: Array | None = None
@@ -213,7 +213,7 @@ def expose(bench: TrueBench, scene: TrueScene, angles_deg: dict[str, Array]) -> 
         out[k] = _sample_mosaic(light) if bench.mosaic else light[0]
         for factor in bench.level:
             out[k] *= factor(k, angles)
-        # What would pass without any polarization: a quarter of m00, whatever the state.
+        # Light without any polarization: a quarter of m00, in every state.
         out[k] += bench.shared_light * 0.25 * m[..., 0, 0]
     if bench.order is not None:
         out = out[bench.order]

@@ -1,4 +1,4 @@
-"""Faults of a lab that a declared model does not know, by physics; each changes a TrueBench and says what it did.
+"""Faults of a lab that a declared model lacks, by physics; each changes a TrueBench and returns the truth.
 
 `LISTED` are causes that `processing/effects` knows, by its kinds; `UNLISTED` are causes that it does not know. A truth
 is (kind, place, parameters in the units of the effect): only what can be compared number by number.
@@ -17,7 +17,7 @@ from simulators.blind.undeclared_captures import TrueBench
 
 @dataclass(frozen=True)
 class Truth:
-    """What was done to a bench; stays in the truth file."""
+    """A fault of a bench, for the truth file."""
 
     kind: str
     place: str = ""

@@ -1,4 +1,4 @@
-"""Mistakes of wiring and of files: what the program believes of the bench is wrong by a discrete step.
+"""Mistakes of wiring and of files: the declared bench is wrong by a discrete step.
 
 Each changes what the capture file says or how the bench is put together, and its truth has the name of the hypothesis
 that mends it. Sizes that a calibration could find are in `lab_priors`.

@@ -1,4 +1,4 @@
-"""Registers that every GigE Vision camera has at the same addresses: who it is, what it can, where its XML stands."""
+"""Registers that every GigE Vision camera has at the same addresses: identity, abilities, location of its XML."""
 
 import socket
 import struct

@@ -1,4 +1,4 @@
-"""The control protocol of GigE Vision (GVCP) as a camera answers it: discovery, registers, memory, who controls.
+"""The control protocol of GigE Vision (GVCP) as a camera answers it: discovery, registers, memory, control.
 
 Numbers of commands and registers are those that Aravis and Wireshark's dissector have in public.
 """
@@ -22,7 +22,7 @@ _DISCOVERY, _RESEND, _READ_REGISTERS, _WRITE_REGISTERS, _READ_MEMORY, _WRITE_MEM
     0x0086,
 )
 _DONE, _NOT_IMPLEMENTED, _ACCESS_DENIED = 0, 0x8001, 0x8006
-# What a discovery tells are the first registers, as they stand.
+# The answer to a discovery is the first registers as they are.
 _DISCOVERY_BYTES = 0xF8
 HEARTBEAT_MS, CONTROL = 0x0938, 0x0A00
 _SLICE_S = 0.2
@@ -37,17 +37,17 @@ class RegisterDevice(Protocol):
         """Bytes from an address on."""
 
     def write(self, address: int, data: bytes) -> None:
-        """Take bytes from an address on, and do what they command."""
+        """Take bytes from an address on, and obey their commands."""
 
     def resend(self, frame_id: int, first: int, last: int) -> None:
         """Send packets of a frame once more."""
 
     def released(self) -> None:
-        """Nobody controls the camera any more."""
+        """Called when no program controls the camera any more."""
 
 
 def _broadcast_sockets(address: str) -> list[socket.socket]:
-    """Sockets that hear what is sent to all, and to all of the subnet; fewer where another program has them alone."""
+    """Sockets for broadcasts, also of the subnet; fewer where another program has them alone."""
     sockets = []
     for everybody in ("255.255.255.255", address.split(".")[0] + ".255.255.255"):
         listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -62,7 +62,7 @@ def _broadcast_sockets(address: str) -> list[socket.socket]:
 
 
 class ControlChannel:
-    """Answers at one address from `open` to `close`, in a thread of its own."""
+    """Answers at one address from `open` to `close`, in another thread."""
 
     def __init__(self, device: RegisterDevice) -> None:
         self._device = device

@@ -41,7 +41,7 @@ class EventMessages:
     def __init__(self, register: Callable[[int], int]) -> None:
         self._register = register
         self._number = 0
-        # One after another, and not in the thread that exposes: the host may take its time to answer.
+        # One after another, and not in the thread that exposes: the host may answer slowly.
         self._sender = ThreadPoolExecutor(1, "camera events")
 
     def tell(self, address: str, event: int, frame_id: int, time_ns: int) -> None:
@@ -93,7 +93,7 @@ def _is_answered(channel: socket.socket, number: bytes, wait_s: float) -> bool:
         try:
             answer = channel.recv(64)
         except OSError:
-            # Nothing came, or nobody listens there any more.
+            # Nothing came, or no host listens any more.
             return False
         if answer[2:4] == struct.pack(">H", _EVENT_ACK) and answer[6:8] == number:
             return True

@@ -1,4 +1,4 @@
-"""What a simulated camera is set to for an exposure, and what it sends of the counts that its pixel source gives."""
+"""Settings of a simulated camera for an exposure, and the counts that it sends of those of its pixel source."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from drivers.pixel_formats import PixelFormat
 
 @dataclass(frozen=True, slots=True)
 class ExposureInfo:
-    """What the camera is set to for one exposure.
+    """Settings of the camera for one exposure.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class ExposureInfo:
         return self.offset_x, self.offset_y, self.width, self.height
 
     def region_of(self, sensor: NDArray[np.uint16]) -> NDArray[np.uint16]:
-        """What is sent of the counts of the whole sensor; binned pixels are averaged, whatever stands before them."""
+        """The transmitted part of the counts of the whole sensor; binned pixels are averaged, also behind a mosaic."""
         b, d = self.binning, self.decimation
         rows, columns = (size // b * b for size in sensor.shape)
         blocks = sensor[:rows, :columns].reshape(rows // b, b, columns // b, b)

@@ -16,7 +16,7 @@ LEADER, TRAILER, DATA = 1, 2, 3
 # Of IP and UDP, and of GVSP behind them.
 TRANSPORT_BYTES, STREAM_BYTES = 20 + 8, 8
 IMAGE_CHUNK = 1
-# Smaller packets than this are nobody's wish, and would hold nothing.
+# Smaller packets would hold no data.
 _LEAST_PACKET_BYTES = 64
 
 

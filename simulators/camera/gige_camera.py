@@ -46,7 +46,7 @@ _MOST_XML_BYTES = 1 << 24
 _KEPT_FRAMES = 4
 # Between two frames of a camera that runs without triggers.
 _FREE_RUN_S = 0.05
-# Registers of the link, which a user set does not hold: who controls, heartbeat, streams, and where the XML stands.
+# Registers of the link, which a user set does not hold: control, heartbeat, streams, and location of the XML.
 _LINK = ((0x000, 0x100), (0x200, 0x240), (0x600, 0x604), (0x900, 0xA04), (0xB00, 0xB20), (0xD00, 0xD20))
 
 
@@ -236,7 +236,7 @@ class GigeCamera:
             raise error
 
     def fire(self, *, unasked: bool = False) -> None:
-        """Start an exposure from outside, as a pulse on the trigger line does; `unasked`: whatever the source is."""
+        """Start an exposure from outside, as a pulse on the trigger line does; `unasked`: with any trigger source."""
         self._trigger(by_program=False, unasked=unasked)
 
     def value(self, name: str) -> Number:
@@ -270,7 +270,7 @@ class GigeCamera:
             return self._memory.read(address, count)
 
     def write(self, address: int, data: bytes) -> None:
-        """Write registers, and do what was commanded by it."""
+        """Write registers, and obey the commands among them."""
         with self._wake:
             self._memory.write(address, data)
             if address == PACKET_SIZE and self._bootstrap(PACKET_SIZE) & _TEST_PACKET:
@@ -284,7 +284,7 @@ class GigeCamera:
                 if TRIGGER in commands:
                     self._trigger(by_program=True)
             except (NodeError, ArithmeticError, ValueError) as error:
-                # Registers hold whatever is written: no program may end the thread that answers.
+                # Registers take every value: no program may end the thread that answers.
                 self._error = self._error or error
                 return
             if START in commands or STOP in commands:
@@ -297,11 +297,11 @@ class GigeCamera:
                 send(frame, self._bootstrap, self.address, self.lost_ratio, numbers=range(first, last + 1))
 
     def released(self) -> None:
-        """Without anybody who controls it a camera stops."""
+        """Stop the camera when no program controls it."""
         self._begin(acquiring=False)
 
     def _begin(self, *, acquiring: bool) -> None:
-        """Start or stop: whatever was under way ends, and frames are numbered anew."""
+        """Start or stop: a running acquisition ends, and frames are numbered anew."""
         with self._wake:
             self._acquiring, self._triggered, self._frame_id = acquiring, False, self.first_frame_id - 1
             self._run_number += 1
@@ -335,7 +335,7 @@ class GigeCamera:
                 self._tell("missed", 0)
                 return
             self._triggered, self.triggered_s = True, time.monotonic()
-            # Before the command is answered: whoever asks then is told that it exposes.
+            # Before the command is answered: the status then is "exposing".
             self._features.show(exposing=True, armed=False)
             self._wake.notify_all()
 

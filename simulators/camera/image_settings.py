@@ -22,7 +22,7 @@ _OFF = {"Off", "None", "Disabled", "Linear", "ContrastMode_Off", "Normal", "NoTe
 
 
 class Settings(Protocol):
-    """What is asked of a camera's features."""
+    """The interface to a camera's features."""
 
     def number(self, name: str) -> float | None:
         """A number, or None where the camera has it not."""

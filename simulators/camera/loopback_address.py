@@ -52,7 +52,7 @@ class LoopbackAddress:
         # Linux binds any 127.x.x.x, but a driver that looks for cameras asks at the addresses of interfaces.
         if self.address.startswith("127.") and addresses and self.address not in addresses:
             raise self._error("no network interface has that address", f"Add it: ip addr add {self.address}/8 dev lo")
-        # Real time: whoever holds the address may be another program.
+        # Real time: another program may hold the address.
         deadline_s = time.monotonic() + wait_s
         while True:
             fallbacks = [entry for entry in addresses if entry != self.address] if self._elsewhere else []

@@ -1,4 +1,4 @@
-"""The conformance kit: what every axis, camera, source, effect and reflectance model owes, as tests to inherit.
+"""The conformance kit: requirements of every axis, camera, source, effect and reflectance model, as tests to inherit.
 
 A package that brings one inherits the class in a test file of its own and names its kind; pytest does the rest:
 

@@ -1,4 +1,4 @@
-"""The whole of what an axis owes, in one class to inherit."""
+"""All requirements of an axis, in one class to inherit."""
 
 from simulators.conformance.axis_faults import AxisFaults
 from simulators.conformance.axis_noise import EmulatorNoise

@@ -1,4 +1,4 @@
-"""What every axis owes when things go wrong: an error in bounded time that names it, and never a wrong position."""
+"""Requirements of every axis under faults: an error in bounded time that names it, and never a wrong position."""
 
 import time
 

@@ -31,7 +31,7 @@ ROUNDS = int(os.environ.get("UMOV_FUZZ_ROUNDS", "10"))
 
 
 class NoisyWire:
-    """An emulator behind a line that changes, drops and inserts bytes in what it says, a few in a hundred."""
+    """An emulator behind a line that changes, drops and inserts a few percent of the bytes of its replies."""
 
     def __init__(self, emulator: Emulator, seed: int, rate: float) -> None:
         self.emulator = emulator
@@ -69,7 +69,7 @@ def answer_of(call: Callable[[], object]) -> object | None:
 
 
 def seed_of(kind: str) -> int:
-    """The same noise for a kind each time, whatever other kinds there are."""
+    """The same noise for a kind each time, independent of the other kinds."""
     return zlib.crc32(kind.encode())
 
 
@@ -125,7 +125,7 @@ class EmulatorNoise(AxisTests):
                     line.receive(noise.randbytes(noise.randrange(1, 30)))
                 spoken += len(line.take_output())
         assert spoken > 0
-        # Whatever it was told, it is still there for a client that asks properly.
+        # After any input it still answers a correct question.
         line.receive(b"\r\n" * 200)
         for motor in emulator.axes:
             motor.stop()

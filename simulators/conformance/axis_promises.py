@@ -1,4 +1,4 @@
-"""What every axis owes in peace: nothing moves unasked, angles are right, limits hold, a stop stops."""
+"""Requirements of every axis without faults: no motion without a command, right angles, limits, stop."""
 
 import logging
 import math
@@ -93,7 +93,7 @@ class AxisPromises(AxisTests):
                 axis.start_move(10.1)
 
     def test_two_moves_at_once_on_one_axis_are_refused(self, kind: str) -> None:
-        # So slow that nobody arrives before the second move is asked for, however late this thread gets to run.
+        # So slow that the axis does not arrive before the second move, even if this thread runs late.
         with self.served(kind, speed=0.1) as served:
             axis = served.open()
             motion = axis.start_move(60.0)
@@ -106,7 +106,7 @@ class AxisPromises(AxisTests):
     def test_stop_from_another_thread(self, kind: str, caplog: pytest.LogCaptureFixture) -> None:
         with self.served(kind, speed=1.0) as served:
             axis = served.open()
-            # So far that nobody arrives before the stop, however late the thread gets to run.
+            # So far that the axis does not arrive before the stop, even if the thread runs late.
             far_deg = 900.0 if axis.can_stop_a_move else 120.0
             motion = axis.start_move(far_deg)
 

@@ -1,4 +1,4 @@
-"""What every camera owes: settings read back, whole frames of a known exposure, errors in bounded time."""
+"""Requirements of every camera: settings read back, whole frames of a known exposure, errors in bounded time."""
 
 from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, Protocol
@@ -23,12 +23,12 @@ Show = Callable[[int, int, float], NDArray[np.uint16]]
 
 
 class CameraTwin(Protocol):
-    """A simulated camera that sends the real bytes: what the driver under test opens.
+    """A simulated camera that sends the real bytes, for the driver under test.
 
     Attributes
     ----------
     entry : dict
-        What a rig file says of it besides `kind`.
+        Its entry in a rig file, except `kind`.
     elsewhere : dict
         The same of a camera that is not there.
     size : tuple
@@ -56,7 +56,7 @@ class CameraTwin(Protocol):
 
 
 def pixel_source(show: Show) -> Callable[[ExposureInfo], NDArray[np.uint16]]:
-    """What a simulated GigE Vision camera takes its counts from."""
+    """Source of the counts of a simulated GigE Vision camera."""
     return lambda info: show(info.width, info.height, info.exposure_s)
 
 
@@ -66,7 +66,7 @@ class GigeTwin:
     Parameters
     ----------
     show : callable
-        What it shows.
+        Its scene.
     description : str
         Name of a maker's feature table, of which it takes the first format with room for its counts.
     """
@@ -103,7 +103,7 @@ class GigeTwin:
 
 
 class LightScene:
-    """What the camera sees: its own exposure number, exposure time and an angle that the test turns."""
+    """Scene of the camera: its exposure number, exposure time and an angle that the test turns."""
 
     def __init__(self) -> None:
         self.angle_deg = 0.0
@@ -141,7 +141,7 @@ class CameraConformance:
 
     @pytest.fixture
     def scene(self) -> LightScene:
-        """What the twin sees."""
+        """The scene of the twin."""
         return LightScene()
 
     @pytest.fixture

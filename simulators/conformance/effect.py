@@ -1,4 +1,4 @@
-"""What every effect owes: nothing at zero, bounds and units that make sense, a derivative that is one, a cause."""
+"""Requirements of every effect: no change at zero, sensible bounds and units, a right derivative, a cause."""
 
 import sys
 from pathlib import Path

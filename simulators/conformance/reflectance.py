@@ -1,4 +1,4 @@
-"""What every reflectance model owes: physical, reciprocal matrices, the same by both routes, read from a file."""
+"""Requirements of every reflectance model: physical, reciprocal matrices, equal by both routes, read from a file."""
 
 from pathlib import Path
 from typing import ClassVar

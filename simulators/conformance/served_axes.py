@@ -1,4 +1,4 @@
-"""Emulated axes for the conformance tests: a fast clock, short waits, a port of its own."""
+"""Emulated axes for the conformance tests: a fast clock, short waits, one port each."""
 
 import contextlib
 from collections.abc import Iterator
@@ -41,7 +41,7 @@ class ServedAxes:
 
 
 class AxisTests:
-    """What every conformance class of an axis needs: the name under which its emulator is served.
+    """Base of the conformance classes of an axis: the name under which its emulator is served.
 
     Attributes
     ----------

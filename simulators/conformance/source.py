@@ -1,4 +1,4 @@
-"""What every light source owes: its light follows, is read back, and never ends in a state that nobody knows."""
+"""Requirements of every light source: its light follows, is read back, and never ends in an unknown state."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -68,12 +68,12 @@ START_DEG = {"apt-k10cr1": 33.0, "apt-kdc101": 12.0, "apt-kbd101": 57.0}
 
 
 class APTUnit:
-    """One unit with one channel, at an address of its own.
+    """One unit with one channel and one address.
 
     Parameters
     ----------
     send : callable
-        Gets what the unit says.
+        Gets the bytes that the unit sends.
     """
 
     def __init__(self, model: APTModel, axis: EmulatedAxis, address: int, send: Callable[[bytes], None]) -> None:
@@ -111,7 +111,7 @@ class APTUnit:
         axis = self.axis
         bits = 1 << 8 | 1 << 28 | (1 << 31 if self.enabled else 0)
         if axis.is_moving():
-            # Both bits may be set, whatever the direction (qmi).
+            # Both bits may be set, in either direction (qmi).
             bits |= 1 << 9 if axis.homing else 0b11_0000
             bits |= 1 << 29
         else:
@@ -121,7 +121,7 @@ class APTUnit:
         return bits
 
     def command(self, message_id: int, message: bytes) -> None:
-        """Do one message; a real unit does not answer what it does not know."""
+        """Do one message; a real unit does not answer an unknown one."""
         data = message[6:]
         handlers: dict[int, Callable[[bytes, bytes], None]] = {
             0x0005: lambda *_: self._send_long(0x0006, hardware_info(self.model)),
@@ -237,7 +237,7 @@ class APTUnit:
         self._moves_ends, self._home_ends = 0x0466, False
 
     def advance(self) -> None:
-        """Say what is due by now: the end of a motion, the periodic status."""
+        """Send the due messages: the end of a motion, the periodic status."""
         moving, now_s = self.axis.is_moving(), self.axis.clock.now_s()
         if self._home_ends and not moving:
             self._home_ends = False
@@ -258,7 +258,7 @@ class APTUnit:
 
 
 def hardware_info(model: APTModel) -> bytes:
-    """Answer of a unit or of a rack to the question who it is."""
+    """Answer of a unit or of a rack to the request for its identity."""
     notes = b"APT unit (emulated)"
     # qmi and pylablib read hardware version, modification and channels from the last three words.
     return struct.pack(
@@ -314,7 +314,7 @@ class APTEmulator(Emulator):
                 self._rack(message_id, message)
 
     def _rack(self, message_id: int, message: bytes) -> None:
-        """What the rack itself answers: who it is, and which bays hold a unit."""
+        """Answers of the rack itself: its identity, and the bays that hold a unit."""
         if message_id == 0x0005:
             info = hardware_info(self.model)
             self._reply(struct.pack("<HHBB", 0x0006, len(info), HOST | 0x80, RACK) + info)
@@ -323,7 +323,7 @@ class APTEmulator(Emulator):
             self._reply(struct.pack("<HBBBB", 0x0061, message[2], state, HOST, RACK))
 
     def _do_make_foreign(self, reply: bytes) -> bytes:
-        # The answer to another question: a channel state nobody asked for.
+        # The answer to another question: the state of a channel.
         return struct.pack("<HBBBB", 0x0212, 1, 1, HOST, 0x22)
 
     def _do_advance(self) -> None:

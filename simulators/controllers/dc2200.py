@@ -66,7 +66,7 @@ class DC2200Emulator(Emulator):
         return answer or None
 
     def _led(self, part: str, led: int, tail: str) -> str | None:
-        """Answer to a question, an empty text for a setting, None for what is not known."""
+        """Answer to a question, an empty text for a setting, None for an unknown command."""
         words = tail.split()
         setting_of = {"STATE": "STAT", "MODE": "MODE", "CBRIGHTNESS:BRIGHTNESS": "LEVEL"}
         # AMPLitude may be left out, or be cut to its capitals, as SCPI has it.

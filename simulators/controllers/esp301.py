@@ -60,7 +60,7 @@ class ESPAxis:
 class ESP301Emulator(Emulator):
     """A controller with up to three axes; `true_deg(i)` belongs to axis i + 1."""
 
-    # Replies carry no address at all: the answer to another question is all that can be wrong.
+    # Replies carry no address: the only possible fault is the answer to another question.
     foreign = b"ESP301 Version 3.0.1 6/1/99\r\n"
     pieces = (b"1PA", b"1OR1", b"1MO", b"TB?", b"1DH", b"1SL", b";", b"\r", b"AB", b"2TP?")
 
@@ -85,7 +85,7 @@ class ESP301Emulator(Emulator):
         while self._waiting:
             if self._wait_for is not None:
                 if self._wait_for.axis.is_moving() or self.clock.now_s() < self._go_on_s:
-                    # A stop is heard at once, whatever the queue waits for.
+                    # A stop is obeyed at once, also while the queue waits.
                     urgent = [text for text in self._waiting if text.endswith("ST") or text == "AB"]
                     self._waiting = [text for text in self._waiting if text not in urgent]
                     for text in urgent:

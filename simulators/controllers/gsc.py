@@ -28,7 +28,7 @@ LONGEST_RAMP_MS = 1000
 class GSCEmulator(Emulator):
     """A controller with one or two stages."""
 
-    # The answer to another question: the state of an input that nobody asked for.
+    # The answer to another question: the state of an input.
     foreign = b"I:4\r\n"
     pieces = (b"Q:\r\n", b"\r\nQ:\r\n", b"M:1+P", b"A:1-P", b"G:", b"H:1", b"L:", b"!:\r\n", b"?:V", b"J:1+", b"\r\n")
     tells_limits = False
@@ -41,7 +41,7 @@ class GSCEmulator(Emulator):
         self._lines = LineCollector()
         self._is_accepted = True
         self._free = False
-        # What the next drive does: for each axis a target in degrees, or a direction of jogging.
+        # Of the next drive: for each axis a target in degrees, or a direction of jogging.
         self._next: dict[int, float | str] = {}
 
     def pulses(self, index: int) -> int:
@@ -98,7 +98,7 @@ class GSCEmulator(Emulator):
             return self._drive()
         if (speed := _SPEED.fullmatch(text)) is not None:
             return self._set_speeds(speed[1], re.findall(r"S(\d+)F(\d+)R(\d+)", speed[2]))
-        # A GSC-02 must be told the direction; a GSC-01 knows it.
+        # A GSC-02 needs the direction; a GSC-01 knows it.
         home = re.fullmatch(r"H:([12W])([+-]{0,2})", text)
         if home is not None and bool(home[2]) != self.acknowledges:
             for index in self._chosen(home[1]):
@@ -115,7 +115,7 @@ class GSCEmulator(Emulator):
         hold = re.fullmatch(r"C:([12W])([01]{1,2})", text)
         if hold is None or not self._chosen(hold[1]):
             return False
-        # What a free motor of a GSC-02 answers is not in its manual.
+        # The answer of a free motor of a GSC-02 is not in its manual.
         self._free = self.acknowledges and hold[2] == "0"
         return True
 
@@ -161,7 +161,7 @@ class GSCEmulator(Emulator):
     def _stop(self, selection: str) -> bool:
         indices = self._chosen(selection)
         for index in indices:
-            # While it homes, a GSC-02 obeys what is meant for all axes alone.
+            # While it homes, a GSC-02 obeys only commands for all axes.
             if selection == "W" or self.acknowledges or not self.axes[index].homing:
                 self.axes[index].stop()
         self._next = {}

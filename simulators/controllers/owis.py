@@ -73,7 +73,7 @@ class OWISEmulator(Emulator):
         return str(self._memory[text[1:]]) if text[1:] in self._memory else None
 
     def _obey(self, text: str) -> None:
-        """Do a command; none is answered, and what is wrong is passed over."""
+        """Do a command; none is answered, and a wrong one is ignored."""
         order = _ORDER.fullmatch(text)
         if order is None or int(order[2]) > len(self.axes):
             return

@@ -29,14 +29,14 @@ SET_POSITION, IGNORE_POSITION = struct.Struct("<ihqB5x"), 0x01
 NO_FEEDBACK, INTEGRATED_DRIVER = 5, 2
 LIMITED_SPEED_WITH_RAMPS = 0x90
 GAP_S = 0.4
-# Bytes behind the letters of what the maker's library sets and reads back, and nothing here acts on.
+# Bytes behind the letters of settings that the maker's library reads back and the emulator ignores.
 KEPT = {
     b"pwr": 14, b"sec": 22, b"pid": 42, b"sni": 22, b"sno": 10, b"eio": 12, b"brk": 19, b"ctl": 87, b"joy": 16,
     b"ctp": 12, b"urt": 10, b"nmf": 24, b"nvm": 30, b"emf": 42, b"eas": 48, b"est": 40, b"nme": 24,
 }  # fmt: skip
 # Answered with the letters alone, and without effect on the angle: power, memory, measurement.
 TAKEN = frozenset((b"pwof", b"save", b"read", b"sars", b"rers", b"eesv", b"eerd", b"stms"))
-# Bytes of what is read only: measurements, chart.
+# Bytes of read-only data: measurements, chart.
 READ_ONLY = {b"getm": 210, b"getc": 32}
 
 
@@ -87,7 +87,7 @@ class StandaEmulator(Emulator):
         }
 
     def count_deg(self) -> float:
-        """What it counts now, in degrees of the stage."""
+        """The present count, in degrees of the stage."""
         return self.axis.mechanical_deg() - self._zero_deg
 
     def _do_receive(self, data: bytes) -> None:

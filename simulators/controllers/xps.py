@@ -41,21 +41,21 @@ class PositionCompare:
     _seen_deg: float = math.nan
 
     def look(self, here_deg: float) -> None:
-        """Note what was passed since the last look; the axis turned one way only in between."""
+        """Record the pulses since the last look; the axis turned one way only in between."""
         there_deg, self._seen_deg = self._seen_deg, here_deg
         if not self.on or math.isnan(there_deg):
             return
         count = round((self.high_deg - self.low_deg) / self.step_deg) + 1
         crossed_deg = [self.low_deg + k * self.step_deg for k in range(count)]
         low, high = sorted((there_deg, here_deg))
-        # What was on the mark at the last look has given its pulse.
+        # A mark at the position of the last look has given its pulse.
         crossed_deg = [deg for deg in crossed_deg if low <= deg <= high and deg != there_deg]
         self.pulses_deg += crossed_deg if here_deg >= there_deg else crossed_deg[::-1]
 
 
 @dataclass
 class Gathering:
-    """Positions and velocities taken in the servo's cycle; `types` are what is taken, by axis and name."""
+    """Positions and velocities taken in the servo's cycle; `types` are the quantities, by axis and name."""
 
     types: list[tuple[EmulatedAxis, str]] = field(default_factory=list)
     samples: list[tuple[float, ...]] = field(default_factory=list)
@@ -64,7 +64,7 @@ class Gathering:
     start_s: float = 0.0
 
     def look(self, now_s: float) -> None:
-        """Take what is due by now; no motion began since the last look."""
+        """Take the samples that are due; no motion began since the last look."""
         while len(self.samples) < self.target_count:
             due_s = self.start_s + len(self.samples) * self.every_s
             if due_s > now_s:
@@ -291,7 +291,7 @@ class XPSConversation(Emulator):
         return ""
 
     def _parse_quantity(self, word: str) -> tuple[EmulatedAxis, str]:
-        """The axis of ``Group1.Pos.CurrentPosition`` and what is gathered of it."""
+        """Axis and quantity of ``Group1.Pos.CurrentPosition``."""
         group, _, quantity = word.partition(".Pos.")
         if group not in self._controller.groups or quantity not in ("CurrentPosition", "CurrentVelocity"):
             raise XpsError(WRONG_FORMAT)

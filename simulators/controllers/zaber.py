@@ -72,7 +72,7 @@ class ZaberDevice:
         return sorted(self.extra_flags) + ["WR"] * (not self.axis.homed) + ["NI"] * self.interrupted
 
     def position(self) -> int:
-        """Position as `get pos` tells it."""
+        """Position as `get pos` reports it."""
         axis = self.axis
         if not axis.homed and not axis.is_moving() and axis.max_deg is not None and not self.interrupted:
             # Seen on real hardware: without a reference the highest position is shown (labscript-devices#39).
@@ -238,7 +238,7 @@ class ZaberEmulator(Emulator):
 
     def _do_receive(self, data: bytes) -> None:
         for line in self._lines.lines(data):
-            # A new command starts at the slash, whatever was on the line before.
+            # A new command starts at the slash, after any bytes before it.
             start = line.rfind("/")
             if start >= 0:
                 self._command(line[start:])

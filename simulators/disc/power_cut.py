@@ -1,4 +1,4 @@
-"""What a disc holds after a power cut, made again from the record of all calls that changed it.
+"""Content of a disc after a power cut, rebuilt from the record of all calls that changed it.
 
 What was synced is there. Of what was not, each write may be there, or not, or some of its sectors; changes of names are
 there up to some point of their order. This is stricter than most file systems: a new file's name counts as safe only

@@ -1,4 +1,4 @@
-"""Which controllers are emulated, and what a rig file says of one that is served."""
+"""The emulated controllers, and the rig entry of one that is served."""
 
 import importlib
 import pkgutil
@@ -16,7 +16,7 @@ from simulators.serial.serve_options import ServeOptions
 
 
 def axis_configs(emulator: Emulator, port: str, *, homed: bool = False) -> list[AxisConfig]:
-    """Return a rig entry for every axis of an emulator behind `port`; none for what is not a motion controller.
+    """Return a rig entry for every axis of an emulator behind `port`; none if it is no motion controller.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def axis_configs(emulator: Emulator, port: str, *, homed: bool = False) -> list[
 
 
 def source_configs(emulator: Emulator, port: str) -> list[BaseModel]:
-    """Return the rig entry for an emulated light source behind `port`; none for what is not one."""
+    """Return the rig entry for an emulated light source behind `port`; None if it is not one."""
     return _entries("source_configs", emulator, port)
 
 

@@ -47,7 +47,7 @@ class SimulatedRig:
         self.emulators: dict[str, Emulator] = {}
         self.bench: SimulatedBench | None = None
         self.camera: GigeCamera | None = None
-        #: What the operator does with a source that has no cable: False while it is covered.
+        #: A source without a cable is covered by the operator: False while it is covered.
         self.uncovered: Callable[[], bool] = lambda: True
         self._with_camera = with_camera
         self._ports: dict[str, ServedPort] = {}
@@ -121,7 +121,7 @@ class SimulatedRig:
             camera.check()
 
     def camera_device(self) -> str:
-        """What the rig file of a real camera would give as `device`."""
+        """Value of `device`, as in the rig file of a real camera."""
         return self.camera.address if self.camera is not None else self.config.camera_address
 
     # --- what acquisition asks ---------------------------------------------------------------------------
@@ -142,7 +142,7 @@ class SimulatedRig:
     def prepare(
         self, sample: str, instrument: InstrumentModel, wavelength_nm: float, omega_deg: float | None = None
     ) -> None:
-        """Place a sample, put in the optics and the filter: what an operator does between captures.
+        """Place a sample, put in the optics and the filter, as an operator does between captures.
 
         With `omega_deg` the scene is computed for that arm angle now, instead of in the first exposure there.
         """
@@ -186,7 +186,7 @@ class SimulatedRig:
             index = self._next_index
             self._next_index += 1
             if self.bench is None:
-                # Nobody has placed a sample: the camera looks into the dark.
+                # No sample is placed: the camera looks into the dark.
                 return np.zeros((info.height, info.width), dtype=np.uint16)
             counts = info.region_of(self.bench.expose(angles, info.exposure_s, index, light=light, time_s=time_s))
         if self.config.stamp:

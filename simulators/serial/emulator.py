@@ -108,7 +108,7 @@ class EmulatedAxis:
         self._start(target_deg + self._origin_deg)
 
     def run(self, velocity_deg_s: float) -> None:
-        """Turn until told to stop, or to the end of the travel, at a signed velocity."""
+        """Turn until a stop, or to the end of the travel, at a signed velocity."""
         far_deg = 1e6 if velocity_deg_s > 0 else -1e6
         end = self.max_deg if velocity_deg_s > 0 else self.min_deg
         self._start((far_deg if end is None else end) + self._origin_deg, abs(velocity_deg_s))
@@ -214,7 +214,7 @@ class Emulator(ABC):
             return self.axes[axis].true_deg()
 
     def light_at(self, wavelength_nm: float) -> float:
-        """Relative light, 0 to 1, that it lets through or gives at a wavelength; 1 for what is no light source."""
+        """Relative light, 0 to 1, that it lets through or gives at a wavelength; 1 if it is no light source."""
         return 1.0
 
     def receive(self, data: bytes) -> None:

@@ -7,7 +7,7 @@ MOST = 256
 
 
 class LineCollector:
-    """What an emulator has heard of a line.
+    """The bytes of a line that an emulator has received.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from simulators.serial.served_port import ServedPort
 
 
 class SerialEmulator(Protocol):
-    """What a port needs of an emulator."""
+    """The interface of an emulator that a port needs."""
 
     def receive(self, data: bytes) -> None:
         """Take bytes from the host, in any portions."""
@@ -61,7 +61,7 @@ class PtyPort(ServedPort):
                 if self._master in readable:
                     data = self._read()
                     if data is None:
-                        # Nobody has the port open: what is not yet sent is lost, as on a cable without a host.
+                        # The port is not open: unsent bytes are lost, as on a cable without a host.
                         pending = b""
                         time.sleep(BEAT_S)
                     else:

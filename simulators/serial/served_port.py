@@ -1,4 +1,4 @@
-"""What every port that serves an emulator has: a thread of its own, a way to stop it, and the error that ended it."""
+"""Base of the ports that serve an emulator: a thread, a way to stop it, and the error that ended it."""
 
 import os
 import threading

@@ -12,7 +12,7 @@ from simulators.serial.served_port import ServedPort
 
 
 class NetworkEmulator(Protocol):
-    """What a TCP port needs of an emulator: a conversation of its own for each connection."""
+    """The interface of an emulator that a TCP port needs: a new conversation for each connection."""
 
     def connect(self) -> SerialEmulator:
         """Begin a conversation."""

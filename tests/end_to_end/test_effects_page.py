@@ -15,7 +15,7 @@ def test_the_page_is_that_of_the_effects():
     assert effects_page.PAGE.read_text(encoding="utf-8") == effects_page.page()
 
 
-@pytest.mark.parametrize("kind", effects_page.pictured())
+@pytest.mark.parametrize("kind", effects_page.pictured_kinds())
 def test_a_picture_shows_the_residual_of_its_fault(kind):
     shown = cv2.imread(str(effects_page.PICTURES / f"{kind}.png")).astype(int)
     out = BytesIO()
@@ -27,7 +27,7 @@ def test_a_picture_shows_the_residual_of_its_fault(kind):
 
 
 def test_no_picture_is_of_an_effect_that_went():
-    assert {path.stem for path in effects_page.PICTURES.glob("*.png")} == set(effects_page.pictured())
+    assert {path.stem for path in effects_page.PICTURES.glob("*.png")} == set(effects_page.pictured_kinds())
 
 
 def test_the_faulty_rig_is_the_simulated_one_with_faults(configs):

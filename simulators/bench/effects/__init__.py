@@ -1,4 +1,4 @@
-"""What a real bench does that its declared model does not: one small object a cause, sorted by where it acts."""
+"""Effects of a real bench that its declared model lacks: one small object a cause, sorted by where it acts."""
 
 from typing import Annotated
 

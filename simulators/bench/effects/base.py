@@ -1,4 +1,4 @@
-"""What a real bench does that its declared model does not: small objects, each acting at one stage of an exposure.
+"""Effects of a real bench that its declared model lacks: small objects, each acting at one stage of an exposure.
 
 A stage sees what light sees there: `train` the axes and the optics, `source` the light level, `optics` the image in
 electrons before the detector collects it, `detector` the electrons collected. Each effect is one physical cause with

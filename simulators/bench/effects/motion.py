@@ -84,6 +84,6 @@ class AnglePlay(BenchEffect):
     def angles(self, angles_deg: dict[str, float], shot: Shot) -> dict[str, float]:
         drive = angles_deg[self.axis]
         before = drive - self.play_deg if self._shaft is None else self._shaft
-        # What the shaft remembers is its own business, not part of the settings, which stay as they are.
+        # The memory of the shaft is no part of the settings, which stay as they are.
         object.__setattr__(self, "_shaft", min(max(before, drive - self.play_deg), drive + self.play_deg))
         return angles_deg | {self.axis: float(self._shaft or 0.0)}

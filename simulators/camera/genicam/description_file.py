@@ -14,7 +14,7 @@ from processing.doors import MOST_DEPTH, MOST_TEXT_BYTES, one_line, require_file
 from processing.yaml_file import ConfigError
 from simulators.camera.genicam.formula import Number
 
-# What a damaged archive raises: of the format, of its compressions, and of what this Python has not.
+# Errors of a damaged archive: of the format, of its compressions, and of those that this Python lacks.
 _DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError, RuntimeError)
 
 
@@ -78,7 +78,7 @@ def _unpacked(path: Path, served: bytes) -> bytes:
             if len(files) != 1:
                 raise ConfigError(f"{path}: has {len(files)} XML files, and a camera's archive has one")
             with archive.open(files[0]) as file:
-                # What it says of its size need not be true.
+                # The stated size need not be true.
                 text = file.read(MOST_TEXT_BYTES + 1)
     except (*_DAMAGED, OSError, ValueError) as why:
         raise ConfigError(f"{path}: is no zip archive that can be read ({one_line(why)})") from why

@@ -26,7 +26,7 @@ _IMAGE_CHUNK_BYTES = 8
 
 
 class FeatureValues:
-    """What the camera is set to and what it tells.
+    """Settings and status of the camera.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class FeatureValues:
     # --- what it is set to -------------------------------------------------------------------------------
 
     def info(self, frame_id: int) -> ExposureInfo:
-        """What an exposure that begins now is set to."""
+        """Settings of an exposure that begins now."""
         number = self._number
         return ExposureInfo(
             exposure_s=number(EXPOSURES, 0) * 1e-6,

@@ -68,7 +68,7 @@ def _shift(a: Number, b: Number, *, left: bool) -> Number:
     return int(a) << int(b) if left else int(a) >> int(b)
 
 
-# How tightly each binds, and what it does; those that bind alike are taken from the left.
+# Precedence and operation of each; operators of equal precedence are left-associative.
 _BINARY: dict[str, tuple[int, Callable[[Number, Number], Number]]] = {
     "||": (1, lambda a, b: int(bool(a) or bool(b))),
     "&&": (2, lambda a, b: int(bool(a) and bool(b))),

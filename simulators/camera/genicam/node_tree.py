@@ -106,7 +106,7 @@ class NodeTree:
             return self._own_value(name) if target is None else self.value(target)
 
     def set_value(self, name: str, value: Number) -> None:
-        """Set a node through whatever stands behind it, whether a program may or not. Raises NodeError."""
+        """Set a node through the nodes behind it, also a read-only one. Raises NodeError."""
         with self._passing(name):
             node = self.node(name)
             if node.tag in REGISTERS:
@@ -153,7 +153,7 @@ class NodeTree:
         return next((reference for reference in references if reference is not None), None)
 
     def _way_down(self, name: str) -> Iterator[str]:
-        """A node, and those that its value comes from, one after another."""
+        """A node, and the nodes that its value comes from, in order."""
         current: str | None = name
         for _ in range(_LONGEST_WAY):
             if current is None:
@@ -163,7 +163,7 @@ class NodeTree:
         raise self.error(name, "refers to itself")
 
     def command_value(self, name: str) -> Number:
-        """What a program writes to give a command."""
+        """The value that a program writes to give a command."""
         node = self.node(name)
         reference = node.findtext("pCommandValue")
         return self.value(reference) if reference is not None else self._number(name, node.findtext("CommandValue"))

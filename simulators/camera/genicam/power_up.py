@@ -1,4 +1,4 @@
-"""What a played camera stands at when it is switched on, and what follows from its settings.
+"""Settings of a played camera when it is switched on, and values that follow from its settings.
 
 A description says where values stand, not which ones a camera has there. So its memory begins with zeros, and from
 them every feature is given the nearest value that its description allows: what can be implemented is, what can be
@@ -17,7 +17,7 @@ from simulators.camera.genicam.node_tree import NodeError, NodeTree
 EXPOSURES = (*EXPOSURE_US, "ExposureTimeRaw")
 START_EXPOSURE_US = 10_000
 TEMPERATURE_C = 38.5
-# Upper limits where a camera keeps them in a register of its own; microseconds, decibels, counts.
+# Upper limits where a camera keeps them in a register; microseconds, decibels, counts.
 _USUAL_MAX = {
     **dict.fromkeys(EXPOSURES, 10_000_000),
     "Gain": 24,
@@ -91,13 +91,13 @@ def follow(nodes: NodeTree, sensor: tuple[int, int]) -> None:
                 tell(nodes, name, value)
                 registers |= nodes.inputs(name)
         top = nodes.limit_node(offset, "Max") if offset in nodes else None
-        # On some cameras an offset may be anywhere on the sensor, whatever the width.
+        # On some cameras an offset may be anywhere on the sensor, for every width.
         if top is not None and not registers & nodes.inputs(top):
             tell(nodes, top, max(0, span - int(nodes.value(size))))
 
 
 def tell(nodes: NodeTree, name: str, value: Number) -> bool:
-    """Let a node come out at a value by what the camera alone can write; False if it does not."""
+    """Give a node a value through registers that only the camera writes; False if it does not work."""
     return _make(nodes, name, lambda now: now == value, (value,))
 
 
@@ -121,7 +121,7 @@ def _make(nodes: NodeTree, name: str, good: Callable[[Number], bool], candidates
     if good(nodes.value(name)):
         return True
     adjustable = [register for register in sorted(nodes.inputs(name)) if nodes.is_the_cameras_own(register)]
-    # One after another, and all of them together for a formula that wants several.
+    # One after another, and all of them together for a formula with several registers.
     for registers in (*([register] for register in adjustable), adjustable):
         before = {register: nodes.value(register) for register in registers}
         for candidate in candidates:

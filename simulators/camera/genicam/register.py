@@ -11,7 +11,7 @@ Number = int | float
 
 
 class RegisterMemory:
-    """Bytes at the addresses that somebody wrote to; zero everywhere else."""
+    """Bytes at the addresses that were written to; zero everywhere else."""
 
     def __init__(self) -> None:
         self._pages: dict[int, bytearray] = {}
