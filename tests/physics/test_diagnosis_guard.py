@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE
 from processing.diagnosis.instrument.mueller_error import chances, lasts
 from processing.diagnosis.search.decision import PredictedChange, predicted_change
-from processing.diagnosis.search.names import PART_OF_LEFT
+from processing.diagnosis.search.fit import Fit, HeldOut, Solution
+from processing.diagnosis.search.space import Space, Sums
 
 NOTHING = PredictedChange(0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -48,9 +48,19 @@ def test_nothing_that_is_changed_makes_nothing_worse() -> None:
     assert predicted_change(np.array([1e-9]), np.array([1e-9]), np.eye(1), np.eye(1)).chance_worse == 0
 
 
-def test_beside_a_sample_that_changed_nothing_is_kept_for_later_captures() -> None:
-    assert lasts(NOTHING, [PART_OF_LEFT])
-    assert not lasts(NOTHING, [PART_OF_LEFT, OF_THE_SAMPLE])
+def _solved(before: list[float], after: list[float]) -> Solution:
+    """A correction that leaves so much excess of each capture."""
+    held = [HeldOut(sum(x), 1.0, 1.0, 1.0, np.array([[1.0, 1.0, e, 1.0] for e in x])) for x in (before, after)]
+    space, fit = Space(()), Fit(np.zeros(0), Sums.empty(1, 0, len(before)), 0.0)
+    return Solution(space, fit, held[0], space, fit, held[1])
+
+
+def test_of_captures_whose_sample_changed_the_others_bear_a_correction_out() -> None:
+    assert lasts(NOTHING, _solved([100.0], [0.0]))
+    assert not lasts(NOTHING, _solved([100.0], [0.0]), {0})
+    assert lasts(NOTHING, _solved([100.0, 50.0], [0.0, 0.0]), {0})
+    assert not lasts(NOTHING, _solved([100.0, 50.0], [0.0, 55.0]), {0})
+    assert not lasts(NOTHING, _solved([100.0, 50.0], [0.0, 0.0]), {0, 1})
     told = [check.name for check in chances(NOTHING, NOTHING, lasting=False, each={})]
     assert told[-1].endswith("so it is written for these captures alone")
 

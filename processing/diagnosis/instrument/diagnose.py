@@ -13,7 +13,7 @@ from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.captures.screening import screen_capture
 from processing.diagnosis.instrument.answer import calibrated, capture_report, missing, noise_report, not_measured
-from processing.diagnosis.instrument.doubts import doubts, testable
+from processing.diagnosis.instrument.doubts import doubts, find_changed, testable
 from processing.diagnosis.instrument.mueller_error import MuellerErrors, chances, lasts
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
@@ -147,7 +147,7 @@ def _judge(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring:
     errors = MuellerErrors.of(validation, posterior, solved)
     now, later, of_each = errors.changes(solved)
     each = dict(zip((c.name for c in problem.captures), of_each, strict=True)) if len(of_each) > 1 else {}
-    lasting = lasts(later, names.doubt.values())
+    lasting = lasts(later, solved, find_changed(validation, solved, names.doubt))
     judgement = Judgement(
         named=bool(names.named or switched or posterior.any_cause),
         sure=bool(names.sure or switched),

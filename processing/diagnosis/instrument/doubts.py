@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -24,8 +24,7 @@ NOT_ALIKE = "it differs from part to part of the image, which this effect does n
 STANDS_OUT = float(np.log(SURE / (1 - SURE)))
 #: Reasons that say that something else is there, of which what the cause explains is left over.
 ELSE = (STANDS, NOT_ALIKE)
-#: The reason for which nothing is written for later captures: the sample or its light changed, and what is found beside
-#: that may be a part of it.
+#: The sample of a capture, or its light, changed: what that capture alone says of the instrument may be a part of that.
 OF_THE_SAMPLE = "it differs from part to part of the image, which a source does not"
 
 
@@ -69,6 +68,14 @@ def _doubt_of(
     if not alike and any(_uneven(even, solved, c, cause) for c in cause.candidates):
         return NOT_ALIKE
     return None
+
+
+def find_changed(problem: InstrumentProblem, solved: Solution, doubt: Mapping[Cause, str]) -> set[int]:
+    """Captures whose sample or light changed, by the doubts of causes."""
+    even = Evenness(problem, solved.space, solved.fit.values)
+    causes = [cause for cause, why in doubt.items() if why == OF_THE_SAMPLE]
+    uneven = [c for cause in causes for c in cause.candidates if _uneven(even, solved, c, cause)]
+    return {k for c in uneven for k, nm in enumerate(problem.wavelengths_nm) if c.acts(k, nm)}
 
 
 def _static_shifts(problem: InstrumentProblem, solved: Solution, causes: Sequence[Cause]) -> list[Cause]:

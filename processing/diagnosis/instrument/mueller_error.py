@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.decision import PredictedChange, chance_checks, predicted_change
@@ -290,9 +289,11 @@ def _in_words(change: PredictedChange) -> str:
     return f"{change.rounded_chance:.2g}" if change.rounded_chance > 0 else "less than 0.0001"
 
 
-def lasts(later: PredictedChange, reasons: Collection[str] = ()) -> bool:
-    """Whether what belongs to the instrument may be used for later captures; `reasons` for which names are doubted.
+def lasts(later: PredictedChange, solved: Solution, changed: Collection[int] = ()) -> bool:
+    """Whether what belongs to the instrument may be used for later captures.
 
-    Where the sample changed, what is found of the instrument may be a part of that.
+    Of captures whose sample `changed` it may be a part of that: the others have to bear it out.
     """
-    return later.chance_worse <= CHANCE_WORSE and OF_THE_SAMPLE not in reasons
+    others = [k for k in range(len(solved.after.shares)) if k not in changed]
+    gain = sum(solved.before.of(k).excess - solved.after.of(k).excess for k in others)
+    return later.chance_worse <= CHANCE_WORSE and (not changed or gain > 0)
