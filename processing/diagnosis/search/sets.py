@@ -257,18 +257,22 @@ class Sets:
         weights, now = np.zeros((len(self.groups), self.taus.size)), self.noise.log_likelihood(fit.excess)
         for members, s, q in self._cavities(state, fit, inverse, right):
             value, along = _along_axes(s, q)
-            t2 = (self.taus**2)[:, None]
-            explained = np.sum(t2 * along / (1 + t2 * value), axis=2)
-            gain = 0.5 * (explained - np.sum(np.log1p(t2 * value), axis=2))
+            # Groups of one size have one prior of their variance.
+            prior = self.tau_weight[members[0]]
+            kept = np.flatnonzero(prior)
+            t2 = (self.taus[kept] ** 2)[:, None]
+            scaled = t2 * value
+            explained = np.sum(t2 * along / (1 + scaled), axis=2)
+            gain = 0.5 * (explained - np.sum(np.log1p(scaled), axis=2))
             if follow and (new := state.tau[members] == 0).any():
                 excess = fit.excess - state.unit * explained[new]
-                wider = np.log1p(t2 * value[new] * (state.unit / self.noise.units(excess))[..., None])
+                wider = np.log1p(scaled[new] * (state.unit / self.noise.units(excess))[..., None])
                 gain[new] = self.noise.log_likelihoods(excess) - now - 0.5 * np.sum(wider, axis=2)
-            gain += np.log(np.maximum(self.tau_weight[members], LEAST_WEIGHT))
+            gain += np.log(prior[kept])
             top = gain.max(axis=1, keepdims=True)
-            weights[members] = np.exp(gain - top)
-            total = weights[members].sum(axis=1, keepdims=True)
-            weights[members] /= total
+            share = np.exp(gain - top)
+            total = share.sum(axis=1, keepdims=True)
+            weights[members[:, None], kept] = share / total
             log_odds[members] = (top + np.log(total))[:, 0]
         is_included = (state.tau > 0) & self.free
         log_odds = np.where(self.free, log_odds + self.prior_odds(is_included), np.inf)
