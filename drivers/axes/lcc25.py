@@ -4,10 +4,11 @@
 RMS, 0 to 25), `mode?` (1 for voltage 1, 2 for voltage 2, 0 for a change between the two), `enable?`. The driver uses
 voltage 1.
 
-Documents: Thorlabs' own serial example (github.com/Thorlabs/Light_Control_and_Manipulation_Examples, C#/LCC25), and the
-commands and descriptions of its library LCC25CommandLib, which has every command above; the manual itself was not
-found. The controller does not see the crystal: `settle_s` is the time that it takes.
-Unverified on hardware: everything; form of the answers to `mode?` and `enable?` (public drivers: a number).
+Documents: Thorlabs' serial example (github.com/Thorlabs/Light_Control_and_Manipulation_Examples, C#/LCC25) for the line,
+the empty command, `*idn?` and `volt1`; Thorlabs' library LCC25CommandLib for every command, and its file
+LCC25_COMMAND_LIB.py for limits and for the numbers of modes and output. The library reads both answers as numbers: it
+ran against the emulator. The controller does not see the crystal: `settle_s` is the time that it takes.
+Unverified on hardware: everything.
 """
 
 import math

@@ -1,10 +1,11 @@
-"""OWIS position control units of the PS family (PS10, PS35, PS90) with rotation stages.
+"""OWIS position control units PS10 and PS90 with rotation stages.
 
-Documents: OWIS' own libraries ps90.dll and ps10.dll, whose commands and letters of motion are those used here; of the
-user manual of the PS 90 (9013.0180, 31.07.2014) only the first pages could be read. Modes of homing and lines that end
-in CR: the public EPICS driver motorOWISPS, and public programs for a PS90. States are one letter for each axis
-(``?ASTAT``). The libraries also ask ``?REFST``, whether an axis is homed; its answer is not documented there, so the
-session remembers. Speed and limits have units that are not documented either: the rig file says the speed.
+Documents: OWIS' libraries ps90.dll (1.0.9.1, 2014, with ps90.h and the example ps90tool.c) and ps10.dll (with
+ps10func.cs, 2016). Every command of this driver is a string in both, and on the wire ps90.dll ends it with CR.
+The meaning of a letter of ``?ASTAT`` is the result of their GetAxisState, GetMoveState and GetErrorState: ready, off,
+one of eleven motions, one of seven errors. The words of the errors, and what the modes of REF do, come from public
+copies of the manual. A home counts where it ended at zero, and its motion was seen (P) or GetRefReady (`?REFST`)
+answers 1. Speed and limits have units that are not documented: the rig file says the speed.
 Unverified on hardware: everything.
 """
 
@@ -21,8 +22,7 @@ from drivers.session_reference import SessionReferenceAxis, SessionReferenceConf
 from drivers.text_line import TextLine
 
 READY = "R"
-# Positioning or turning at a speed, with or without a curve and microsteps; reference, release of a switch, phase.
-MOVING = frozenset("TSVWXYCPFJNH")
+MOVING = frozenset("TSPFVJWXYCN")
 NOT_READY = {"I": "initialized, not ready", "O": "disabled", "U": "not released"}
 FAULTS = {
     "L": "disabled at a limit switch",
@@ -30,10 +30,12 @@ FAULTS = {
     "A": "disabled after an error of the limit switches",
     "M": "disabled after an error of the motion controller",
     "Z": "disabled after a timeout",
+    "H": "disabled while the phases of its motor are initialized",
     "E": "disabled after a motion error",
 }
 STATES = READY + "".join(sorted(MOVING)) + "".join(NOT_READY) + "".join(FAULTS)
 INITIALIZED_S = 5.0
+_REFERENCE = re.compile("[01]")
 _COUNT = re.compile(r"-?\d{1,10}")
 _STATES = re.compile(rf"[{STATES}?]{{1,9}}")
 # Not a message, which starts with its number.
@@ -51,7 +53,7 @@ class Config(SessionReferenceConfig):
     counts_per_deg: float = Field(gt=0, description="what the unit counts in a degree: (micro)steps or encoder")
     speed_deg_s: float = Field(gt=0, description="speed of moves as the unit is set, for deadlines")
     acceleration_deg_s2: float = Field(default=100.0, gt=0, description="acceleration as the unit is set")
-    home_mode: int = Field(default=4, ge=0, le=7, description="mode of REF; 4: to the reference switch, which is zero")
+    home_mode: int = Field(default=4, ge=0, le=7, description="mode of REF; it must end at zero, as 4 does")
     baudrate: int = Field(default=9600, description="bits a second, as the unit is set")
 
     def place(self) -> str:
@@ -111,8 +113,12 @@ class OWISAxis(SessionReferenceAxis):
         return any(state in MOVING for state in states)
 
     def _homing_is_proved(self, counts: float, tolerance: float) -> bool:
-        # A short way home may be over before the first look; its end is zero.
-        return self._saw_motion or abs(counts) <= tolerance
+        if abs(counts) > tolerance:
+            self._lost = f"homing ended at {counts:g} counts instead of zero: change home_mode"
+            return False
+        # A unit that was just switched on counts zero as well; a short way home may be over before the first look.
+        question = f"?REFST{self.config.axis}"
+        return self._saw_motion or agreed(lambda: self._line.ask(question, _REFERENCE)) == "1"
 
     def _do_start_move(self, counts: float) -> None:
         self._make_ready()

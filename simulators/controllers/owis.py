@@ -58,18 +58,19 @@ class OWISEmulator(Emulator):
             return None
         if question[2] is None:
             states = "".join(self._state(index) for index in range(len(self.axes)))
-            return {"ASTAT": states, "VERSION": "PS90-V6.2-240219", "MSG": "00 NO ERROR", "ERR": "0"}.get(question[1])
+            return {"ASTAT": states, "VERSION": "PS90-V6.2-240219", "MSG": "00 NO ERROR", "ERR": "0", "COMEND": "0"}.get(question[1])
         index = int(question[2]) - 1
         if index >= len(self.axes):
             return None
         questions: dict[str, Callable[[], int]] = {
             "CNT": lambda: self._counts(index),
             "PSET": lambda: self._targets[index],
+            "REFST": lambda: self.axes[index].homed,
             "ESTAT": lambda: 0,
             "MOTYPE": lambda: 2,
         }
         if question[1] in questions:
-            return str(questions[question[1]]())
+            return str(int(questions[question[1]]()))
         return str(self._memory[text[1:]]) if text[1:] in self._memory else None
 
     def _obey(self, text: str) -> None:

@@ -104,6 +104,46 @@ def test_owis_makes_an_axis_ready_before_it_goes() -> None:
             axis.check_fault()
 
 
+@pytest.mark.parametrize(
+    ("seen", "ends_at", "homed"),
+    [(b"P", b"0", True), (b"P", b"3200", False), (b"R", b"0", False), (b"R", b"0", True)],
+)
+def test_an_owis_home_ends_at_zero_and_was_seen(seen: bytes, ends_at: bytes, homed: bool) -> None:
+    at, count = (b"?ASTAT\r", b"R\r"), (b"?CNT1\r", ends_at + b"\r")
+    with (
+        scripted(
+            (b"?VERSION\r", b"PS10-V6.2-240219\r"),
+            *[at] * 4,
+            (b"REF1=4\r", b""),
+            *[(b"?ASTAT\r", seen + b"\r")] * 2,
+            *[at] * 2,
+            *[count] * 2,
+            at,
+            *[(b"?REFST1\r", b"%d\r" % homed)] * (2 * (seen == b"R")),
+        ) as path,
+        LineRegistry(clock=patient_clock()) as lines,
+    ):
+        axis = owis.open("psa", owis.Config(port=path, counts_per_deg=100, speed_deg_s=10), lines)
+        axis._do_start_home()
+        assert axis.is_moving() is (seen == b"P")
+        assert axis.is_homed() is homed
+
+
+@pytest.mark.parametrize("letter", "LBAMZHE")
+def test_what_owis_takes_for_an_error_is_no_motion(letter: str) -> None:
+    state = (b"?ASTAT\r", letter.encode() + b"\r")
+    with (
+        scripted((b"?VERSION\r", b"PS90-V6.2-240219\r"), *[state] * 6) as path,
+        LineRegistry(clock=patient_clock()) as lines,
+    ):
+        axis = owis.open("psa", owis.Config(port=path, counts_per_deg=100, speed_deg_s=10), lines)
+        assert not axis.is_moving()
+        with pytest.raises(CommandRejected, match=owis.FAULTS[letter]):
+            axis.check_fault()
+    # The two lists of ps90.dll and ps10.dll (GetErrorState, GetMoveState).
+    assert (set(owis.FAULTS), owis.MOVING) == (set("LBAMZHE"), set("TSPFVJWXYCN"))
+
+
 def test_the_speed_of_a_conex_agp_is_that_of_the_rig_file() -> None:
     with (
         scripted(
