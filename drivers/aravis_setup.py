@@ -347,22 +347,37 @@ class Setup:
         features = self._features
         if trigger is not None:
             self.hardware = trigger == "hardware"
+        frame = self._frame_trigger()
         with features.asking("set AcquisitionMode to Continuous"):
             self._camera.set_acquisition_mode(self._aravis.AcquisitionMode.CONTINUOUS)
             # Every trigger off first: one left on by another program would hold frames back.
             self._camera.clear_triggers()
         if features.find(("ExposureMode",)) is not None:
             features.set_choice("ExposureMode", "Timed")
-        if features.find(("TriggerSelector",)) is not None:
-            # Before SFNC 2 some cameras call it ExposureStart.
-            old = {"FrameStart", "ExposureStart"} & set(features.choices("TriggerSelector")) == {"ExposureStart"}
-            features.set_choice("TriggerSelector", "ExposureStart" if old else "FrameStart")
+        if frame is not None:
+            features.set_choice("TriggerSelector", frame)
         features.set_choice("TriggerSource", self._config.trigger_line if self.hardware else "Software")
         edge = "TriggerActivation"
         if self.hardware and edge not in self._config.features and features.find((edge,)) is not None:
             features.set_choice(edge, self._config.trigger_edge)
         features.set_choice("TriggerMode", "On")
         self.status = AcquisitionStatus(features)
+
+    def _frame_trigger(self) -> str | None:
+        """The entry of TriggerSelector whose trigger starts an exposure; None for a camera without that selector."""
+        entries = self._features.choices("TriggerSelector")
+        # Before SFNC 2 some cameras call it ExposureStart.
+        frame = next((entry for entry in ("FrameStart", "ExposureStart") if entry in entries), None)
+        reason = f"its TriggerSelector offers only {', '.join(entries)}" if entries and frame is None else None
+        if self._features.kind("TriggerMode") != "choice":
+            reason = "it has no TriggerMode"
+        if reason is not None:
+            raise SettingRefused(
+                f"camera {self._name}, one frame at each trigger",
+                reason,
+                "Use a camera that exposes when it is triggered: others expose while the axes move",
+            )
+        return frame
 
     def set_light(self, settings: CameraSettings, *, stopped: bool) -> None:
         """Exposure, gain and black level: no exposure is under way when this is called.

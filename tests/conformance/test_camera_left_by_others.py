@@ -53,7 +53,9 @@ class Left:
 
     def play(self, **left: Number | str) -> GigeCamera:
         self._path.write_text(self.text)
-        camera = self._stack.enter_context(GigeCamera("LEFT-1", *SIZE, self._show, description=self._path))
+        camera = self._stack.enter_context(
+            GigeCamera("LEFT-1", *SIZE, self._show, description=self._path, complete=False)
+        )
         for name, value in left.items():
             camera.leave(name, value)
         return camera
@@ -241,3 +243,18 @@ def test_a_load_that_changes_nothing_is_seen(left: Left) -> None:
     (text,) = camera.warnings()
     assert "changed nothing" in text
     assert "ShotMixing" in text
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("TriggerMode", "ExposureControl", "it has no TriggerMode"),
+        ("FrameStart", "LineStart", "its TriggerSelector offers only AcquisitionStart, LineStart"),
+    ],
+)
+def test_a_camera_that_no_trigger_makes_expose_is_named_so(left: Left, old: str, new: str, said: str) -> None:
+    left.text = left.text.replace(old, new)
+    left.play()
+    with pytest.raises(SettingRefused, match=f"one frame at each trigger: {said}.*Use a camera") as caught:
+        left.open().configure(LIGHT)
+    assert "arv-tool" not in str(caught.value)
