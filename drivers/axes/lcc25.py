@@ -4,8 +4,8 @@
 RMS, 0 to 25), `mode?` (1 for voltage 1, 2 for voltage 2, 0 for a change between the two), `enable?`. The driver uses
 voltage 1.
 
-Documents: Thorlabs' serial example (github.com/Thorlabs/Light_Control_and_Manipulation_Examples, C#/LCC25) for the line,
-the empty command, `*idn?` and `volt1`; Thorlabs' library LCC25CommandLib for every command, and its file
+Documents: Thorlabs' serial example (github.com/Thorlabs/Light_Control_and_Manipulation_Examples, C#/LCC25) for the
+line, the empty command, `*idn?` and `volt1`; Thorlabs' library LCC25CommandLib for every command, and its file
 LCC25_COMMAND_LIB.py for limits and for the numbers of modes and output. The library reads both answers as numbers: it
 ran against the emulator. The controller does not see the crystal: `settle_s` is the time that it takes.
 Unverified on hardware: everything.

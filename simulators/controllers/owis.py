@@ -58,7 +58,8 @@ class OWISEmulator(Emulator):
             return None
         if question[2] is None:
             states = "".join(self._state(index) for index in range(len(self.axes)))
-            return {"ASTAT": states, "VERSION": "PS90-V6.2-240219", "MSG": "00 NO ERROR", "ERR": "0", "COMEND": "0"}.get(question[1])
+            answers = {"ASTAT": states, "VERSION": "PS90-V6.2-240219", "MSG": "00 NO ERROR", "ERR": "0", "COMEND": "0"}
+            return answers.get(question[1])
         index = int(question[2]) - 1
         if index >= len(self.axes):
             return None

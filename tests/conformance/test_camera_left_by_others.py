@@ -10,12 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.camera import CameraSettings
-from drivers.cameras import aravis
 from drivers.errors import SettingRefused
 from simulators.camera.exposure import ExposureInfo
-from simulators.camera.genicam.formula import Number
-from simulators.camera.gige_camera import GigeCamera
-from simulators.clock import patient_clock
+from tests.conformance.described_camera import DescribedCamera
 
 STYLE = Path(__file__).parent / "descriptions" / "in_the_style_of_makers.xml"
 SIZE = (64, 48)
@@ -23,46 +20,12 @@ LIGHT = CameraSettings(exposure_s=5e-3, pixel_format="Mono12p")
 SEEN = ((np.arange(SIZE[0] * SIZE[1]) * 7) % 2000 + 100).astype(np.uint16).reshape(SIZE[::-1])
 
 
-class Left:
-    """Plays the description with further features, and opens the driver on it."""
+class Left(DescribedCamera):
+    """Plays the description in the style of makers; `infos` are its exposures."""
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
-        self._path, self._stack = folder / "camera.xml", stack
-        self.text = STYLE.read_text()
-        self._next = 0x0080_0000
+        super().__init__(folder, stack, STYLE.read_text(), SIZE, self._show)
         self.infos: list[ExposureInfo] = []
-
-    def add(self, name: str, node: str, access: str = "RW", kind: str = "IntReg", length: int = 4) -> None:
-        """Add a feature: `node` is its element, in which VALUE stands for the register behind it."""
-        self._next += 0x100
-        register = (
-            f'<{kind} Name="{name}At"><Address>{self._next:#x}</Address><Length>{length}</Length><AccessMode>{access}'
-            "</AccessMode><pPort>Device</pPort><Cachable>NoCache</Cachable>"
-            f"{'<Sign>Unsigned</Sign>' if kind == 'IntReg' else ''}<Endianess>BigEndian</Endianess></{kind}>"
-        )
-        node = node.replace("VALUE", f"<pValue>{name}At</pValue>")
-        self.text = self.text.replace("</Category>", f"<pFeature>{name}</pFeature></Category>", 1)
-        self.text = self.text.replace("</RegisterDescription>", f"{node}{register}</RegisterDescription>")
-
-    def choice(self, name: str, *entries: str, access: str = "RW") -> None:
-        listed = "".join(f'<EnumEntry Name="{entry}"><Value>{k}</Value></EnumEntry>' for k, entry in enumerate(entries))
-        self.add(name, f'<Enumeration Name="{name}">{listed}VALUE</Enumeration>', access)
-
-    def flag(self, name: str) -> None:
-        self.add(name, f'<Boolean Name="{name}">VALUE<OnValue>1</OnValue><OffValue>0</OffValue></Boolean>')
-
-    def play(self, **left: Number | str) -> GigeCamera:
-        self._path.write_text(self.text)
-        camera = self._stack.enter_context(
-            GigeCamera("LEFT-1", *SIZE, self._show, description=self._path, complete=False)
-        )
-        for name, value in left.items():
-            camera.leave(name, value)
-        return camera
-
-    def open(self, **config: object) -> aravis.AravisCamera:
-        settings = aravis.Config(device="127.0.0.1", **config)  # type: ignore[arg-type]
-        return self._stack.enter_context(aravis.open("camera", settings, patient_clock()))
 
     def _show(self, info: ExposureInfo) -> NDArray[np.uint16]:
         self.infos.append(info)
