@@ -10,7 +10,7 @@ from drivers import genicam
 from drivers.acquisition_status import AcquisitionStatus
 from drivers.aravis_library import interface_of
 from drivers.camera import CameraSettings
-from drivers.errors import CameraError, CameraLost, SettingRefused
+from drivers.errors import CameraError, SettingRefused, ignore_refusals
 from drivers.exposure_and_gain import RATE_CONTROL, ExposureAndGain
 from drivers.genicam import Features
 from drivers.neutral_features import NeutralFeatures
@@ -244,16 +244,12 @@ class Setup:
         for axis in ("Horizontal", "Vertical"):
             name = f"{what}{axis}"
             if name not in self._config.features and self._one_factor(name) not in (None, 1.0):
-                try:
+                with ignore_refusals():
                     if self._features.kind(name) == "choice":
                         ones = [entry for entry in self._features.choices(name) if re.sub(r"\D", "", entry) == "1"]
                         self._features.set_value(name, ones[0] if ones else "Off")
                     else:
                         self._features.set_number((name,), 1)
-                except CameraLost:
-                    raise
-                except CameraError:
-                    return
 
     def _one_factor(self, name: str) -> float | None:
         """Factor along one axis: a number, or an entry such as X2; None where the camera has none."""

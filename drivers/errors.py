@@ -1,5 +1,7 @@
 """Errors of devices: each has the request, the answer and the advice."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -134,6 +136,17 @@ class CameraBusy(CameraError):
 
 class CameraLost(CameraError):
     """The camera stopped answering, or control over it was lost."""
+
+
+@contextmanager
+def ignore_refusals() -> Iterator[None]:
+    """Go on after the block where the camera refuses something in it; a lost camera is raised."""
+    try:
+        yield
+    except CameraLost:
+        raise
+    except CameraError:
+        pass
 
 
 class FrameLost(CameraError):

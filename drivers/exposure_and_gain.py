@@ -11,7 +11,7 @@ import re
 from typing import Literal
 
 from drivers import genicam
-from drivers.errors import CameraError, CameraLost, SettingRefused
+from drivers.errors import CameraError, CameraLost, SettingRefused, ignore_refusals
 from drivers.genicam import Features
 from drivers.pixel_formats import PixelFormat
 
@@ -149,13 +149,9 @@ class ExposureAndGain:
             return
         low, high = self._features.limits(name)
         neutral = {"dB": 0.0, "factor": 1.0, None: low}[self._unit_of_gain(name)]
-        try:
+        # One that is selected and locked: `All` sets it.
+        with ignore_refusals():
             self._features.set_number((name,), min(max(neutral, low), high), floor=_GAIN_FLOOR_DB)
-        except CameraLost:
-            raise
-        except CameraError:
-            # Selected and locked: `All` sets it.
-            return
 
     def set_gain(self, gain_db: float) -> None:
         """Set the gain.
@@ -222,13 +218,9 @@ class ExposureAndGain:
         sufficient = [bits for bits in entry_of_bits if bits >= fmt.bits]
         if not entry_of_bits or (self.converter_bits() or 0) >= fmt.bits:
             return
-        try:
+        # After a refusal the value read back gives the end of the counts.
+        with ignore_refusals():
             self._features.set_value(name, entry_of_bits[min(sufficient) if sufficient else max(entry_of_bits)])
-        except CameraLost:
-            raise
-        except CameraError:
-            # The value read back gives the end of the counts.
-            return
 
     def converter_bits(self) -> int | None:
         """Bits of the converter as the camera tells them; None where it does not."""

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from drivers.errors import CameraError, CameraLost, SettingRefused
+from drivers.errors import CameraError, CameraLost, SettingRefused, ignore_refusals
 from drivers.genicam import EXPOSURE_US, Features
 
 # What makers call an enumeration's entry that switches something off.
@@ -265,13 +265,10 @@ class NeutralFeatures:
 
     def _try(self, name: str, value: str | float | bool) -> bool:
         """Set a feature; False where the camera does not take it."""
-        try:
+        with ignore_refusals():
             self._features.set_value(name, value)
             return True
-        except CameraLost:
-            raise
-        except CameraError:
-            return False
+        return False
 
     def _set(self, name: str, rule: Rule) -> None:
         if self._features.find((name,)) is None:
@@ -281,12 +278,9 @@ class NeutralFeatures:
             self._try(name, neutral)
 
     def _value(self, name: str) -> str | float | bool | None:
-        try:
+        with ignore_refusals():
             return self._features.value(name)
-        except CameraLost:
-            raise
-        except CameraError:
-            return None
+        return None
 
     def _neutral_value(self, name: str, rule: Rule) -> str | float | bool | None:
         """The value to be set; None where no value of this feature is known to be neutral."""
@@ -301,14 +295,10 @@ class NeutralFeatures:
             return next((word for word in words if word in choices), None)
         if kind != "number" or not isinstance(rule.neutral, str):
             return None
-        try:
+        with ignore_refusals():
             low, high = self._features.limits(name)
-        except CameraLost:
-            raise
-        except CameraError:
-            return None
-        neutral = {"off": 0.0, "least": low, "one": 1.0}[rule.neutral]
-        return min(max(neutral, low), high)
+            return min(max({"off": 0.0, "least": low, "one": 1.0}[rule.neutral], low), high)
+        return None
 
     def _not_neutral(self) -> Iterator[tuple[str, Rule]]:
         for name, rule in self._rules or ():
