@@ -33,7 +33,7 @@ class Cell:
     ----------
     status : a key of `STATUS`.
     file : name of its file in the library; None where there is none yet.
-    told : remark, in words.
+    remark : in words.
     """
 
     number: int
@@ -45,7 +45,7 @@ class Cell:
     reference: bool
     status: str
     file: str | None = None
-    told: str = ""
+    remark: str = ""
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def _cell(
         reference=bool(index.get("reference")) or plan.get("role") == "flat" or sample.get("kind") == "air",
         status=status,
         file=None if entry is None else entry.name,
-        told=remark,
+        remark=remark,
     )
 
 

@@ -1,13 +1,30 @@
-"""The closing record of a capture, made of what its segments said at their ends."""
+"""The closing record of a capture, made of the end records of its segments, and the messages of a run for it."""
 
 import json
+import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from acquisition.capture.header import now
 from acquisition.capture.time_ledger import add_summaries
 from acquisition.rig import alarms
+
+
+@dataclass
+class Messages:
+    """Messages for the closing record; the first 200 are kept."""
+
+    texts: list[str] = field(default_factory=list)
+    dropped: int = 0
+
+    def add(self, text: str) -> None:
+        """Note a message with its time."""
+        if len(self.texts) < 200:
+            self.texts.append(f"{time.strftime('%H:%M:%S')} {text[:500]}")
+        else:
+            self.dropped += 1
 
 
 def closing_record(records: Sequence[dict[str, Any]], last: dict[str, Any]) -> dict[str, Any]:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from acquisition.capture.auto_exposure import find_exposure
+from acquisition.capture.closing import Messages
 from acquisition.capture.frame_checks import FrameChecks
-from acquisition.capture.messages import Messages
 from acquisition.capture.plan import ARM, AutoExposure
 from acquisition.capture.time_ledger import Entry, TimeLedger
 from acquisition.capture.wall_clock import WallClock

@@ -122,7 +122,7 @@ def test_each_capture_of_a_campaign_has_its_sign(lab, client, drr_capture):
     folder = campaign(lab, drr_capture)
     view = read_campaign(folder, Library(lab), running=None)
     assert [cell.status for cell in view.cells] == ["done", "flagged", "partial", "failed", "missing"]
-    assert "20 % of the pixels" in view.cells[1].told.replace("20.00", "20")
+    assert "20 % of the pixels" in view.cells[1].remark.replace("20.00", "20")
     assert [(bar.name, bar.status) for bar in view.bars] == [("1.h5", "done"), ("2.h5", "partial")]
     # Killed: the log does not say when, the file says when its last state came.
     written = datetime.fromtimestamp((folder / "2.h5").stat().st_mtime, UTC)
