@@ -1,17 +1,19 @@
-"""Bounds of three eigenvalues of a noisy matrix: makes `processing/polarization/eigenvalue_table.npz`.
+"""Bounds of eigenvalues and singular values of noisy 3 x 3 matrices: `processing/polarization/eigenvalue_table.npz`.
 
     python benchmarks/eigenvalue_table.py
 
-takes five minutes. `processing.polarization.sorted_eigenvalues` says what the table holds and in which units.
+takes ten minutes. `processing.polarization.sorted_eigenvalues` says what the table holds and in which units.
 """
 
+import functools
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import optimize
 from scipy.special import ndtr
 
-from processing.polarization.sorted_eigenvalues import COMPONENTS, GAPS, LEAST_OWN, OF_MEAN, TABLE
+from processing.polarization.sorted_eigenvalues import COMPONENTS, GAPS, LEAST_OWN, OF_MEAN, SUMS, TABLE
 
 #: True gaps at which a bound shall hold as often as it claims, and draws at each.
 TRUE = (0, 0.7, 1.4, 2.2, 3, 4, 5.5, 8, 12, 20)
@@ -20,6 +22,14 @@ DRAWS, ROUNDS, LARGEST_STEP = 8000, 30, 0.4
 BOUNDS = tuple(
     (k, d, 3e-4 if abs(d) == 1 else 1e-4) for k, d in ((0, -1), (0, 1), (0, -1.96), (0, 1.96), (1, -1), (1, -1.96))
 )
+#: The same of singular values: the largest, the middle and the smallest one, which carries the sign of the determinant
+#: and has lower bounds only: its upper ones are those of the matrix with the opposite sign.
+TRUE_SINGULAR = (0, 0.8, 1.8, 3.2, 5.5, 10)
+BOUNDS_SINGULAR = tuple(
+    (k, d, 3e-4 if abs(d) == 1 else 1e-4) for k in (0, 1, 2) for d in (-1, 1, -1.96, 1.96) if k < 2 or d < 0
+)
+#: Draws at each, and how far their steps of coverage are smoothed.
+DRAWS_SINGULAR, SPREAD = 2000, 0.1
 
 
 def fall_of(components: float) -> float:
@@ -30,11 +40,14 @@ def fall_of(components: float) -> float:
     return float(optimize.brentq(lambda r: np.sum(r**steps) ** 2 / np.sum(r ** (2 * steps)) - target, 1e-3, 1))
 
 
-def blocks(components: float, random: np.random.Generator, draws: int = DRAWS) -> np.ndarray:
-    """Projection of independent noise in 15 directions on the 8 of a block of three eigenvalues: (draws, 8, 15)."""
-    directions = np.linalg.qr(random.normal(size=(draws, 15, 8)))[0]
+def blocks(components: float, random: np.random.Generator, draws: int = DRAWS, numbers: int = 8) -> np.ndarray:
+    """Projection of independent noise in 15 directions on the 8 of a block of three eigenvalues: (draws, 8, 15).
+
+    Of a block of three singular values the `numbers` are 9.
+    """
+    directions = np.linalg.qr(random.normal(size=(draws, 15, numbers)))[0]
     into = np.swapaxes(directions, 1, 2) * fall_of(components) ** (np.arange(15) / 2)
-    return np.asarray(into / np.sqrt(np.square(into).sum(axis=(1, 2), keepdims=True) / 8))
+    return np.asarray(into / np.sqrt(np.square(into).sum(axis=(1, 2), keepdims=True) / numbers))
 
 
 def basis() -> np.ndarray:
@@ -69,44 +82,98 @@ def deviations(first: float, second: float) -> np.ndarray:
     return np.asarray(true - true.mean())
 
 
-def weights(observed: np.ndarray) -> np.ndarray:
+def singular_values(true: np.ndarray, random: np.random.Generator, into: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Observed singular values (draws, 3) of diag(true), descending, the last with sign, and errors to first order.
+
+    The noise `into` (draws, 9, 15) has variance 1 of an element on average over its directions.
+    """
+    noise = np.einsum("dai,di->da", into, random.normal(size=into.shape[::2]), optimize=True).reshape(-1, 3, 3)
+    left, found, right = np.linalg.svd(np.diag(true) + noise)
+    found[:, 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))
+    slopes = np.einsum("djk,dkl->dkjl", left, right).reshape(-1, 3, 9)
+    return found, np.maximum(np.sqrt(np.square(slopes @ into).sum(axis=-1)), LEAST_OWN)
+
+
+def weights(gaps: Sequence[np.ndarray], nodes: np.ndarray) -> np.ndarray:
     """Weights (draws, nodes) of linear interpolation between the nodes of the table."""
-    out = np.ones((len(observed), 1))
-    for gap in (observed[:, 0] - observed[:, 1], observed[:, 1] - observed[:, 2]):
-        hats = np.stack([np.interp(gap, GAPS, hat) for hat in np.eye(len(GAPS))], axis=1)
-        out = (out[:, :, None] * hats[:, None, :]).reshape(len(observed), -1)
+    out = np.ones((len(gaps[0]), 1))
+    for gap in gaps:
+        hats = np.stack([np.interp(gap, nodes, hat) for hat in np.eye(len(nodes))], axis=1)
+        out = (out[:, :, None] * hats[:, None, :]).reshape(len(gap), -1)
     return out
 
 
 def bound(
-    k: int, deviate: float, smooth: float, drawn: dict[tuple[float, float], tuple[np.ndarray, np.ndarray, np.ndarray]]
+    deviate: float,
+    smooth: float,
+    drawn: Sequence[tuple[np.ndarray, np.ndarray]],
+    *,
+    nodes: tuple[int, ...],
+    spread: float,
 ) -> np.ndarray:
-    """Shifts (nodes, nodes) with which the bound is above the truth as often as it claims."""
-    nodes, level = len(GAPS), ndtr(deviate)
-    step_of = np.diff(np.eye(nodes), axis=0)
-    rough = np.concatenate([np.kron(step_of, np.eye(nodes)), np.kron(np.eye(nodes), step_of)])
-    penalty, shift = smooth * rough.T @ rough, np.full(nodes**2, deviate)
+    """Shifts (nodes) with which the bound is above the truth as often as it claims.
+
+    Parameters
+    ----------
+    drawn : at each truth how far the observed value is off (draws,), and what the shifts do to it (draws, nodes).
+    spread : of further noise.
+    """
+    count, level = int(np.prod(nodes)), ndtr(deviate)
+    rough = []
+    for axis in range(len(nodes)):
+        parts = [np.diff(np.eye(n), axis=0) if k == axis else np.eye(n) for k, n in enumerate(nodes)]
+        rough.append(functools.reduce(np.kron, parts))
+    all_rough = np.concatenate(rough)
+    penalty, shift = smooth * all_rough.T @ all_rough, np.full(count, deviate)
     for _ in range(ROUNDS):
         misses, slopes = [], []
-        for gaps, (observed, errors, plain) in drawn.items():
-            interpolation = errors[:, k : k + 1] * plain
-            z = (observed[:, k] + interpolation @ shift - deviations(*gaps)[k]) / np.sqrt(OF_MEAN)
+        for off, between in drawn:
+            z = (off + between @ shift) / spread
             misses.append(ndtr(z).mean() - level)
-            slopes.append(np.exp(-(z**2) / 2) @ interpolation / len(z) / np.sqrt(2 * np.pi * OF_MEAN))
+            slopes.append(np.exp(-(z**2) / 2) @ between / len(z) / np.sqrt(2 * np.pi) / spread)
         slope = np.array(slopes)
         right = slope.T @ np.array(misses) + penalty @ shift
-        step = np.linalg.solve(slope.T @ slope + penalty + 1e-9 * np.eye(nodes**2), right)
+        step = np.linalg.solve(slope.T @ slope + penalty + 1e-9 * np.eye(count), right)
         shift = shift - np.clip(step, -LARGEST_STEP, LARGEST_STEP)
-    return np.asarray(shift.reshape(nodes, nodes))
+    return np.asarray(shift.reshape(nodes))
+
+
+def of_eigenvalues(random: np.random.Generator) -> np.ndarray:
+    """Shifts (components, bounds, nodes, nodes)."""
+    shifts = []
+    for components in COMPONENTS:
+        into, drawn = blocks(components, random), []
+        for gaps in itertools.product(TRUE, TRUE):
+            observed, errors = eigenvalues(*gaps, random, into)
+            drawn.append((observed - deviations(*gaps), errors, weights(-np.diff(observed.T, axis=0), GAPS)))
+        size = (len(GAPS), len(GAPS))
+        shifts.append([bound(d, smooth, _of(k, drawn), nodes=size, spread=np.sqrt(OF_MEAN)) for k, d, smooth in BOUNDS])
+        print(components)
+    return np.array(shifts, dtype=np.float32)
+
+
+def _of(k: int, drawn: Sequence[tuple[np.ndarray, ...]]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """What `bound` needs of how far value k is off, of its error to first order and of the weights of the nodes."""
+    return [(off[:, k], errors[:, k : k + 1] * plain) for off, errors, plain in drawn]
+
+
+def of_singular_values(random: np.random.Generator) -> np.ndarray:
+    """Shifts (components, bounds, nodes, nodes, nodes)."""
+    shifts = []
+    for components in COMPONENTS:
+        into, drawn = blocks(components, random, DRAWS_SINGULAR, 9), []
+        for first, less, plus in itertools.product(TRUE_SINGULAR, repeat=3):
+            true = np.array([first + (plus + less) / 2, (plus + less) / 2, (plus - less) / 2])
+            observed, errors = singular_values(true, random, into)
+            gaps = (observed[:, 0] - observed[:, 1], observed[:, 1] - observed[:, 2], observed[:, 1] + observed[:, 2])
+            drawn.append((observed - true, errors, weights(gaps, SUMS)))
+        shifts.append(
+            [bound(d, smooth, _of(k, drawn), nodes=3 * (len(SUMS),), spread=SPREAD) for k, d, smooth in BOUNDS_SINGULAR]
+        )
+        print(components, flush=True)
+    return np.array(shifts, dtype=np.float32)
 
 
 if __name__ == "__main__":
-    random, shifts = np.random.default_rng(2026), []
-    for components in COMPONENTS:
-        into, drawn = blocks(components, random), {}
-        for gaps in itertools.product(TRUE, TRUE):
-            observed, errors = eigenvalues(*gaps, random, into)
-            drawn[gaps] = observed, errors, weights(observed)
-        shifts.append([bound(*each, drawn) for each in BOUNDS])
-        print(components)
-    np.savez_compressed(TABLE, shifts=np.array(shifts, dtype=np.float32))
+    made = {"shifts": of_eigenvalues, "singular": of_singular_values}
+    np.savez_compressed(TABLE, **{name: of(np.random.default_rng(2026)) for name, of in made.items()})

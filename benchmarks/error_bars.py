@@ -15,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 from noisy_images import nineteen_samples, noisy_image, seven_instruments
+from scipy.stats import norm
 
-from processing.maps.intervals import ANGLES_OF, whole_range
+from processing.maps.intervals import ANGLES_OF, SIGNED, whole_range
 from processing.maps.quantities import EXTRA, quantities_block
 from processing.maps.xi0 import eigenvalue_block
 from processing.polarization.magnitude import NORMAL_95
@@ -33,8 +34,12 @@ FIXED = 1e-9
 ROUNDING = 1e-6
 #: A vector shorter than so many errors at `BRIGHT` has no direction.
 UNDEFINED_LENGTH = 30
-#: More than this covers too often; pixels of a cell fewer than this part do not tell.
-MOST_95, FEW = 0.97, 0.05
+#: Limits of both coverages and of pulls.
+LIMITS = ((0.64, 0.72), (0.93, 0.97), (0.9, 1.1))
+#: A cell is outside where its pixels are so many standard deviations beyond a limit: by chance one limit in 1000.
+SURE = 3.09
+#: Pixels of a cell fewer than this part do not tell.
+FEW = 0.05
 #: A quantity whose error at `BRIGHT` is larger than this does not exist.
 UNDEFINED = 0.01
 
@@ -47,9 +52,12 @@ class Cell:
     ----------
     has_interval : part of the pixels that have one.
     in_68, in_95 : part of the truths within the intervals; a pixel without one does not cover.
-    rms, mean : of the pulls.
-    everything : part of the pixels whose 95 % interval is all that the quantity can be.
-    in_95_others : part of the truths within the 95 % intervals of all other pixels; NaN where there is none.
+    rms, mean : of the pulls of pixels without `all_95`, each over the error of the side where the truth is.
+    rms_error : standard error of `rms`.
+    all_68, all_95 : part of the pixels whose interval is all that the quantity can be.
+    others_68, others_95 : part of the truths within the intervals of all other pixels; NaN where there is none.
+    at_end : whether the truth is within three errors (the median) of an end of the range.
+    folds : whether the retardance is as near to 180 degrees, where a turn by x is one by x - 360.
     """
 
     quantity: str
@@ -62,8 +70,13 @@ class Cell:
     in_95: float
     rms: float
     mean: float
-    everything: float
-    in_95_others: float
+    rms_error: float
+    all_68: float
+    all_95: float
+    others_68: float
+    others_95: float
+    at_end: bool
+    folds: bool
 
 
 def cells(
@@ -128,20 +141,34 @@ def cells_of(
             exists = np.broadcast_to(exists & (np.nan_to_num(error).max(axis=-1, keepdims=True) > FIXED), value.shape)
             if not exists.any():
                 continue
-            is_finite = exists & np.isfinite(error) & np.isfinite(value)
             tolerance = ROUNDING + 3 * true_error
-            with np.errstate(invalid="ignore", divide="ignore"):
-                pull = (deviation / error)[is_finite]
-                inside_95 = ((deviation <= value - low + tolerance) & (deviation >= value - high - tolerance))[exists]
-                inside_68 = (np.abs(deviation) <= error + tolerance)[exists]
-                if f"{name}_68" in planes:
-                    bounds = planes[f"{name}_68"][..., block]
-                    inside_68 = ((bounds[0] <= true + tolerance) & (true - tolerance <= bounds[1]))[exists]
-            # Where there is no value the interval is everything.
-            unknown = (~np.isfinite(value) & (low <= true + tolerance) & (true - tolerance <= high))[exists]
-            inside_68, inside_95 = inside_68 | unknown, inside_95 | unknown
+            has_68, is_lost = f"{name}_68" in planes, ~np.isfinite(value)
+            bounds = planes[f"{name}_68"][..., block] if has_68 else (value - error, value + error)
+            low_68, high_68 = (np.where(is_lost, *ends) for ends in zip((low, high), bounds, strict=True))
             close = ROUNDING * (360 if "_deg" in name else 1)
-            everything = ((low <= least + close) & (high >= most - close))[exists]
+            inside, everything = [], []
+            with np.errstate(invalid="ignore", divide="ignore"):
+                for down, up in ((low_68, high_68), (low, high)):
+                    # Both from the value: an angle's interval goes on beyond its period.
+                    near = np.where(is_lost, true, value)
+                    distance = np.where(is_lost, 0, deviation)
+                    inside.append(((distance <= near - down + tolerance) & (distance >= near - up - tolerance))[exists])
+                    everything.append(((down <= least + close) & (up >= most - close))[exists])
+                # An interval of 68 % that is even about the value may have to end beyond the range on one side.
+                everything[0] |= everything[1]
+                sides = np.where(deviation > 0, value - low, high - value) / NORMAL_95
+                # An end of the range is no error.
+                end = np.where(deviation > 0, (low <= least + close) | (low == 0), high >= most - close)
+                over = np.where(end | (sides <= 0) | ~np.isfinite(sides), error, sides)
+                pull = (deviation / over)[exists][~everything[1] & (np.isfinite(value) & np.isfinite(error))[exists]]
+                first, last = whole_range(name, true)
+                distance = np.minimum(true - first, last - true) - tolerance
+                near_end = (distance < 3 * np.nanmedian(error, axis=-1, keepdims=True)) & exists[..., :1]
+                at_end = period is None and bool(near_end.any())
+                turn, noise = truth["retardance_deg"][..., k : k + 1], planes["retardance_deg_errors"][..., block]
+                folds = name in SIGNED and bool(180 - turn.max() < 3 * np.nanmedian(noise))
+            square = np.square(pull)
+            rms = np.sqrt(square.mean()) if pull.size else np.nan
             yield Cell(
                 name,
                 name_of_w,
@@ -149,12 +176,17 @@ def cells_of(
                 electrons,
                 sample,
                 float((exists & ~np.isnan(low)).sum() / exists.sum()),
-                float(inside_68.mean()),
-                float(inside_95.mean()),
-                float(np.sqrt(np.mean(pull**2))) if pull.size else np.nan,
+                *(float(part.mean()) for part in inside),
+                float(rms),
                 float(np.mean(pull)) if pull.size else np.nan,
-                float(everything.mean()),
-                float(inside_95[~everything].mean()) if not everything.all() else np.nan,
+                float(square.std() / np.sqrt(len(square)) / (2 * rms)) if pull.size else np.nan,
+                *(float(part.mean()) for part in everything),
+                *(
+                    float(part[~whole].mean()) if not whole.all() else np.nan
+                    for part, whole in zip(inside, everything, strict=True)
+                ),
+                at_end,
+                folds,
             )
 
 
@@ -171,42 +203,73 @@ def _planes(image: object, extra: Sequence[str]) -> dict[str, np.ndarray]:
     }
 
 
-def table(results: Sequence[Cell]) -> str:
-    """Markdown: of every quantity and light level the median and the range of coverage and pulls."""
-    lines = ["| quantity | electrons | cells | 68 % | 95 % | pull | in all limits |", "|---|---|---|---|---|---|---|"]
+def verdicts(cell: Cell, pixels: int) -> tuple[str, str, str]:
+    """Of the 68 and the 95 % interval and the pulls: see `VERDICTS`.
+
+    Parameters
+    ----------
+    pixels : of the cell; components of one pixel count as one.
+    """
+    results = []
+    covered = ((cell.in_68, cell.all_68, cell.others_68), (cell.in_95, cell.all_95, cell.others_95))
+    for (least, most), (inside, whole, others) in zip(LIMITS[:2], covered, strict=True):
+        spread = [SURE * np.sqrt(limit * (1 - limit) / pixels) for limit in (least, most)]
+        rest = SURE * np.sqrt(most * (1 - most) / max(pixels * (1 - whole), 1))
+        if inside < least - spread[0]:
+            results.append("low")
+        elif inside <= most + spread[1]:
+            results.append("in")
+        elif whole > 0 and (not others > most + rest or whole > 1 - FEW):
+            results.append("range")
+        else:
+            results.append("fold" if cell.folds else "high")
+    least, most = LIMITS[2]
+    # All that an interval may miss is in the pixels whose interval is no whole range: they are chosen by their noise.
+    missed = min((1 - LIMITS[1][0]) / max(1 - cell.all_95, 1e-9), 1.0)
+    most *= max(NORMAL_95 / max(norm.isf(missed / 2), 1e-9), 1.0)
+    off = max(least - cell.rms, cell.rms - most) / cell.rms_error if cell.rms_error > 0 else -1.0
+    few = cell.all_95 > 1 - FEW
+    reason = "range" if few else "end" if cell.at_end else "fold" if cell.folds else "low" if cell.rms > 1 else "high"
+    results.append(reason if off > SURE else "in")
+    return results[0], results[1], results[2]
+
+
+#: Verdicts of coverage and pulls, from best to worst. Why "range", "end" and "fold" are no faults: see the study.
+VERDICTS = {
+    "in": "within the limits",
+    "range": "too often by pixels whose interval is the whole range",
+    "end": "pulls at an end of the range",
+    "fold": "a turn by x is one by x - 360",
+    "low": "too seldom, or pulls too large",
+    "high": "too often, or pulls too small",
+}
+
+
+def table(results: Sequence[Cell], pixels: int) -> str:
+    """Markdown: of every quantity and light level median and range of coverage and pulls, and the cells by verdict."""
+    heads = ["quantity", "electrons", "cells", "68 %", "95 %", "pull", *VERDICTS]
+    lines = [f"| {' | '.join(heads)} |", len(heads) * "|---" + "|"]
+    total = dict.fromkeys(VERDICTS, 0)
     for name in dict.fromkeys(c.quantity for c in results):
         for electrons in dict.fromkeys(c.electrons for c in results):
             group = [c for c in results if c.quantity == name and c.electrons == electrons]
-            if group:
-                parts = [[100 * c.in_68 for c in group], [100 * c.in_95 for c in group]]
-                shares = [f"{np.median(p):.0f} ({min(p):.0f} to {max(p):.0f})" for p in parts]
-                pulls = [c.rms for c in group if np.isfinite(c.rms)]
-                pull = f"{np.median(pulls):.2f} ({min(pulls):.2f} to {max(pulls):.2f})" if pulls else "-"
-                valid = sum(holds(c) for c in group)
-                lines.append(f"| {name} | {electrons:g} | {len(group)} | {' | '.join(shares)} | {pull} | {valid} |")
+            if not group:
+                continue
+            shares = []
+            for numbers, form in (([c.in_68 for c in group], ".0%"), ([c.in_95 for c in group], ".0%")):
+                ends = [format(x, form)[:-1] for x in (np.median(numbers), min(numbers), max(numbers))]
+                shares.append("{} ({} to {})".format(*ends))
+            pulls = [c.rms for c in group if np.isfinite(c.rms)]
+            pull = f"{np.median(pulls):.2f} ({min(pulls):.2f} to {max(pulls):.2f})" if pulls else "-"
+            counts = dict.fromkeys(VERDICTS, 0)
+            for cell in group:
+                # The worst of the three.
+                counts[max(verdicts(cell, pixels), key=list(VERDICTS).index)] += 1
+            total = {key: total[key] + count for key, count in counts.items()}
+            numbers = " | ".join(str(n) for n in counts.values())
+            lines.append(f"| {name} | {electrons:g} | {len(group)} | {' | '.join(shares)} | {pull} | {numbers} |")
+    lines.append(f"| all | | {len(results)} | | | | {' | '.join(str(n) for n in total.values())} |")
     return "\n".join(lines) + "\n"
-
-
-def table_of_everything(results: Sequence[Cell]) -> str:
-    """Markdown: of cells whose 95 % intervals cover above 97 %, how many do so as their data do not say more."""
-    lines = ["| quantity | electrons | above 97 % | by whole ranges | whole ranges | others |", 6 * "|---" + "|"]
-    for name in dict.fromkeys(c.quantity for c in results):
-        for electrons in dict.fromkeys(c.electrons for c in results):
-            group = [c for c in results if c.quantity == name and c.electrons == electrons]
-            over_97 = [c for c in group if c.in_95 > MOST_95]
-            # The others cover no more than they claim, or are too few to tell.
-            by_range = [c for c in over_97 if not c.in_95_others > MOST_95 or c.everything > 1 - FEW]
-            weights = np.array([1 - c.everything for c in group])
-            weighted = np.array([c.in_95_others for c in group])[weights > 0] @ weights[weights > 0]
-            share = 100 * np.mean([c.everything for c in group]) if group else 0
-            coverage = f"{100 * weighted / weights.sum():.1f}" if weights.sum() > 0 else "-"
-            lines.append(f"| {name} | {electrons:g} | {len(over_97)} | {len(by_range)} | {share:.0f} | {coverage} |")
-    return "\n".join(lines) + "\n"
-
-
-def holds(cell: Cell) -> bool:
-    """Whether a cell is within the limits: 64 to 72 %, 93 to 97 %, pulls of 0.9 to 1.1."""
-    return 0.64 <= cell.in_68 <= 0.72 and 0.93 <= cell.in_95 <= 0.97 and 0.9 <= cell.rms <= 1.1
 
 
 if __name__ == "__main__":
@@ -229,5 +292,4 @@ if __name__ == "__main__":
             writer = csv.DictWriter(stream, list(asdict(every[0])))
             writer.writeheader()
             writer.writerows(asdict(cell) for cell in every)
-    print(table(every))
-    print(table_of_everything(every))
+    print(table(every, arguments.pixels))

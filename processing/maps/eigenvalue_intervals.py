@@ -13,7 +13,7 @@ from processing.maps.intervals import SEEN, Planes, put
 from processing.polarization.eigenvalue_noise import CorrectedXi0, EigenvalueNoise
 from processing.polarization.magnitude import NORMAL_95, interval, positive
 from processing.polarization.quantities import entropy
-from processing.polarization.sorted_eigenvalues import of_gaps
+from processing.polarization.sorted_eigenvalues import of_gaps, of_singular_values
 from processing.storage.products.images import MuellerImage
 
 #: Equal eigenvalues are seen apart by the noise between them times the root of this, on average.
@@ -21,8 +21,6 @@ _REPELLED = 4.0
 #: Parts of the light not in the dominant process between which entropy passes from that of a nearly pure sample to that
 #: of a depolarizer.
 PURE = (0.15, 0.45)
-#: Largest singular value of 3 x 3 noise of variance 1: 68 % of them are smaller.
-OF_NOISE = 2.8
 
 
 def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, estimate: CorrectedXi0, components: float) -> Array:
@@ -130,24 +128,24 @@ def entropy_of(xi: Array) -> Array:
     return np.asarray(entropy(np.moveaxis(physical / physical.sum(axis=0), 0, -1)))
 
 
-def set_symmetric(planes: Planes, relative: Array) -> None:
-    """Elements of the symmetric decomposition are sorted: near ones mix, and noise alone makes some.
+def set_symmetric(planes: Planes, relative: Array, components: float) -> None:
+    """Elements of the symmetric decomposition are sorted singular values, which noise pushes apart and away from 0.
 
     Parameters
     ----------
     relative : (...), root mean square error of an element other than m00, over m00.
+    components : directions that their noise has, see `sorted_eigenvalues.block_components`.
     """
     names = [f"symmetric_d{k}" for k in (1, 2, 3)]
-    value = np.stack([np.ones_like(planes[names[0]]), *(planes[n] for n in names)]).astype(float)
-    error = np.stack([np.zeros_like(value[0]), *(planes[f"{n}_errors"] for n in names)]).astype(float)
-    near = ~(np.abs(np.diff(value, axis=0)) > SEEN * np.hypot(error[:-1], error[1:]))
+    value, error = (np.stack([planes[f"{n}{end}"] for n in names]).astype(float) for end in ("", "_errors"))
+    unit = np.maximum(np.sqrt(np.mean(np.square(error), axis=0)), relative)
+    shifts = of_singular_values(value, error, unit, components)
+    value = value + shifts.middle
     for k, name in enumerate(names):
-        mixed = near[k] | near[min(k + 1, 2)] | (np.abs(value[k + 1]) < SEEN * relative)
-        spread = np.hypot(error[k + 1], np.where(mixed, (OF_NOISE if k == 0 else 2) * relative, 0))
-        is_finite = np.isfinite(spread)
-        bounds = value[k + 1] - NORMAL_95 * spread, value[k + 1] + NORMAL_95 * spread
+        is_finite = np.isfinite(shifts.half[k])
+        bounds = np.maximum(value[k] - shifts.below[k], -1.0), np.minimum(value[k] + shifts.above[k], 1.0)
         low, high = (np.where(is_finite, b, end) for b, end in zip(bounds, (-1.0, 1.0), strict=True))
-        put(planes, name, value[k + 1], spread, low, high)
+        put(planes, name, value[k], shifts.half[k], low, high)
 
 
 def widen_dominant(planes: Planes, noise: EigenvalueNoise, uneven: float) -> Array:

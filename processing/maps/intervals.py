@@ -26,6 +26,8 @@ Planes = dict[str, NDArray[Any]]
 
 #: Probabilities that fast and slow axis have changed places from which on the 68 and 95 % interval holds both.
 FLIPPED = (0.2, 0.02)
+#: Standard deviations that a normal number exceeds on one side in 5 %.
+ONE_SIDE_95 = 1.644854
 #: A ratio to m00 is determined where m00 is this many times its noise. With less the noise of other elements is as
 #: large as M, so that no first order holds: with 3 the 95 % intervals of eigenvalues covered 86 % at condition 80.
 LEAST_M00 = 5.0
@@ -58,12 +60,13 @@ RANGES: tuple[tuple[str, tuple[float, float] | tuple[tuple[float, ...], tuple[fl
     *((f"retardance_{part}deg", (0.0, 180.0)) for part in ("", "linear_")),
     *((name, (-180.0, 180.0)) for name in SIGNED),
     ("ellipticity_deg", (-45.0, 45.0)),
+    ("xi0", (0.25, 1.0)),
     ("coherency_eigenvalues", ((0.25, 0.0, 0.0, 0.0), (1.0, 1 / 2, 1 / 3, 1 / 4))),
     ("eigenvalue_deviation", (-1 / 3, 1 / 3)),
     ("_circular", (-1.0, 1.0)),
     *((f"symmetric_d{k}", (-1.0, 1.0)) for k in (1, 2, 3)),
     ("dominant_mueller_jones", (-1.0, 1.0)),
-    *((name, (0.0, 1.0)) for name in ("entropy", "td_missed", "diattenuation", "polarizance", "_linear")),
+    *((name, (0.0, 1.0)) for name in ("entropy", "td_missed", "diattenuation", "polarizance", "_linear", "_purity")),
     *((f"depolarization_{part}", (0.0, 1.0)) for part in ("index", "power")),
 )
 #: Relative error of m00 from which on the ratio to it has an interval of its own: below, that would change the longest
@@ -315,7 +318,9 @@ def set_retardance(
         mirrored = value * (1 - 360 / total)
         half = np.where(flips[0], spread + np.abs(mirrored - value), spread)
         far = [np.where(flips[1], pick(value, mirrored), value) for pick in (np.minimum, np.maximum)]
-        low, high = far[0] - NORMAL_95 * spread, far[1] + NORMAL_95 * spread
+        # Between the two nothing is left out, so that noise acts on one side of each.
+        deviate = np.where(flips[1], ONE_SIDE_95, NORMAL_95)
+        low, high = far[0] - deviate * spread, far[1] + deviate * spread
         half, low, high = (
             np.where(is_determined, a, b) for a, b in ((half, 180 + np.abs(value)), (low, -180.0), (high, 180.0))
         )

@@ -254,7 +254,7 @@ def _set_intervals(
     error, linear_error = planes["retardance_deg_errors"], planes["retardance_linear_deg_errors"]
     diattenuation_error = planes["diattenuation_errors"]
     factor: NDArray[np.float64] | float = 1.0
-    uneven = 1.0
+    uneven, components = 1.0, 8.0
     planes["td_missed_noise"] = np.zeros_like(planes["td_missed"])
     planes["valid"] = np.isfinite(planes["td_missed"]).astype(np.uint8)
     if isinstance(image, MuellerImage):
@@ -280,7 +280,7 @@ def _set_intervals(
     if "differential_retardance_deg" in planes:
         set_differential(planes, is_determined & _is_principal(planes))
     if "symmetric_d1" in planes:
-        set_symmetric(planes, uneven * _relative_error(image))
+        set_symmetric(planes, _relative_error(image), components)
     set_ratios(planes, derived, image, m[..., 0, 0])
     if isinstance(image, MuellerImage):
         set_entropy(planes, shrunk, derived["coherency_eigenvalues"].gradient, image)

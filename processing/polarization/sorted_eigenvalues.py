@@ -5,6 +5,7 @@ both gaps; the shifts are those with which a bound holds as often as it claims, 
 is made by `benchmarks/eigenvalue_table.py`.
 """
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +19,9 @@ from processing.polarization.vector_kernels import interpolate
 
 #: Nodes of the table along both gaps, in units of the noise of an element.
 GAPS = np.array([0, 1, 2, 3, 4, 5, 6.5, 8.5, 11, 14.0])
+#: Nodes of the table of singular values along the largest less the middle one, and the middle one less and plus the
+#: smallest, in units of the noise of an element.
+SUMS = np.array([0, 1, 2, 3.5, 5.5, 9.0])
 #: Nodes along the number of directions that the noise has: (tr C)^2 / tr C^2, C being the covariance of the block.
 COMPONENTS = (1.3, 1.6, 2.2, 3.5, 5.5, 8.0)
 #: Errors to first order, of the eigenvectors that are seen, are at least this part of what they are with equal noise.
@@ -104,11 +108,48 @@ def _shifts(first: Array, second: Array, components: float) -> NDArray[np.float6
     places = [np.interp(np.nan_to_num(gap), GAPS, np.arange(len(GAPS))).reshape(-1) for gap in (first, second)]
     node = np.full(first.size, np.interp(components, COMPONENTS, np.arange(len(COMPONENTS))))
     out = np.empty((6, first.size))
-    interpolate(_table(), np.stack([node, *places]), out)
+    interpolate(_table("shifts"), np.stack([node, *places]), out)
     return out.reshape(6, *first.shape)
 
 
+def of_singular_values(values: Array, errors: Array, unit: Array, components: float) -> Sorted:
+    """The same, in the unit of the values, of three singular values (3, ...): the smallest has the determinant's sign.
+
+    Parameters
+    ----------
+    errors : (3, ...), to first order.
+    unit : (...), noise of an element of their matrix.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> found = of_singular_values(np.array([[0.5], [0.4], [-0.2]]), np.full((3, 1), 0.01), np.full(1, 0.01), 8.0)
+    >>> (found.half / 0.01).round(1).ravel().tolist()
+    [1.0, 1.0, 1.0]
+    """
+    first, less, plus = values[0] - values[1], values[1] - values[2], values[1] + values[2]
+    gaps = ((first, less, plus), (first, plus, less))
+    one, other = (_singular([gap / unit for gap in each], components) for each in gaps)
+    own = np.maximum(errors, LEAST_OWN * unit)
+    low, high = own * np.stack([one[0], one[4], one[8]]), own * np.stack([one[1], one[5], -other[8]])
+    low_95, high_95 = own * np.stack([one[2], one[6], one[9]]), own * np.stack([one[3], one[7], -other[9]])
+    middle = (low + high) / 2
+    return Sorted(middle, (high - low) / 2, middle - low_95, high_95 - middle)
+
+
+def _singular(gaps: Sequence[Array], components: float) -> NDArray[np.float64]:
+    """Of the largest and the middle one lower and upper bounds at 68, then at 95 %, of the smallest the lower ones."""
+    places = [np.interp(np.nan_to_num(gap), SUMS, np.arange(len(SUMS))).reshape(-1) for gap in gaps]
+    node = np.interp(components, COMPONENTS, np.arange(len(COMPONENTS)))
+    below = min(int(node), len(COMPONENTS) - 2)
+    table = _table("singular")
+    near = np.ascontiguousarray(table[below] + (node - below) * (table[below + 1] - table[below]))
+    out = np.empty((10, places[0].size))
+    interpolate(near, np.stack(places), out)
+    return out.reshape(10, *gaps[0].shape)
+
+
 @cache
-def _table() -> NDArray[np.float64]:
+def _table(name: str) -> NDArray[np.float64]:
     with np.load(TABLE) as stored:
-        return np.ascontiguousarray(np.moveaxis(stored["shifts"], 1, -1), dtype=float)
+        return np.ascontiguousarray(np.moveaxis(stored[name], 1, -1), dtype=float)

@@ -221,6 +221,15 @@ def _mixed(table: Array, i: Any, x: Any, j: Any, y: Any, k: Any, z: Any) -> Any:
 _at = compiled()(_mixed)
 
 
+def _narrower(half: Any, deviate: Any, share: Any, first: Any) -> Any:
+    """Half an interval of a table, without the noise along the vector that its first node has more than there is."""
+    rest = half * half - deviate * deviate * np.maximum(first - share, 0.0)
+    return np.sqrt(np.maximum(rest, np.minimum(deviate * deviate * share, half * half)))
+
+
+_narrowed = compiled()(_narrower)
+
+
 def _places(values: Array, nodes: Array) -> tuple[NDArray[np.intp], Array]:
     i = np.clip(np.searchsorted(nodes, values, side="right") - 1, 0, len(nodes) - 2)
     return i, np.clip((values - nodes[i]) / (nodes[i + 1] - nodes[i]), 0.0, 1.0)
@@ -246,8 +255,14 @@ def _lengths_at_once(table: Array, nodes: tuple[Array, ...], given: Array, out: 
         low, high, low_95, high_95 = ends
         limit = np.minimum(high * high / _mixed(table[4], i, x, j, y, k, z), high)
         value = np.where(low > 0, low + high, limit) / 2
-        error = np.where(near, np.maximum(high - value, LEAST), high - value)
-        found = np.stack([value, error, np.maximum(low_95, 0.0), high_95]) * unit
+        first, narrow = nodes[1][0] * np.sqrt(components), near & (low > 0)
+        error = np.where(near & ~narrow, np.maximum(high - value, LEAST), high - value)
+        error = np.where(narrow, _narrower(error, DEVIATES[0], along / unit**2, first), error)
+        outer = []
+        for side, end, variance in ((-1, low_95, below), (1, high_95, above)):
+            half = _narrower(side * (end - value), DEVIATES[1], variance / unit**2, first)
+            outer.append(np.where(narrow & (end > 0), value + side * half, end))
+        found = np.stack([value, error, np.maximum(outer[0], 0.0), outer[1]]) * unit
         out[:, part] = np.where(known, found, np.nan)
 
 
@@ -287,7 +302,16 @@ def lengths(table, nodes, given, out, start, stop):  # type: ignore[no-untyped-d
         else:
             # Of an upper limit alone the value goes to zero with what is observed.
             value = min(high * high / _at(table[4], i, x, j, y, k, z), high) / 2
-        error = max(high - value, LEAST) if seen < farthest else high - value
+        error = high - value
+        if seen < farthest and low <= 0:
+            error = max(error, LEAST)
+        elif seen < farthest:
+            first = nodes[1][0] * np.sqrt(components)
+            error = _narrowed(error, DEVIATES[0], along / unit**2, first)
+            for n in (2, 3):
+                if ends[n] > 0:
+                    share, side = given[2 + n, p] / unit**2, 2 * n - 5
+                    ends[n] = value + side * _narrowed(side * (ends[n] - value), DEVIATES[1], share, first)
         out[0, p], out[1, p] = value * unit, error * unit
         out[2, p], out[3, p] = max(ends[2], 0.0) * unit, ends[3] * unit
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from eigenvalue_table import blocks, deviations, eigenvalues
-from error_bars import cells
+from eigenvalue_table import blocks, deviations, eigenvalues, singular_values
+from error_bars import cells, verdicts
 from magnitude_table import node
 from noisy_images import nineteen_samples, noisy_image, seven_instruments
 
@@ -18,20 +18,17 @@ from processing.polarization.magnitude import (
     positive,
     sum_of_singular_values,
 )
-from processing.polarization.sorted_eigenvalues import OF_MEAN, of_gaps
+from processing.polarization.sorted_eigenvalues import OF_MEAN, of_gaps, of_singular_values
 
 PIXELS = 300
 #: Three standard deviations of a part of PIXELS, below the limits of docs/studies/error-bars.md.
 LEAST_68, LEAST_95 = 0.64 - 3 * np.sqrt(0.68 * 0.32 / PIXELS), 0.93 - 3 * np.sqrt(0.95 * 0.05 / PIXELS)
-#: Sorted elements of the symmetric decomposition (docs/error-bars.md, "What does not hold").
-LOOSE = ("symmetric_d1", "symmetric_d2", "symmetric_d3")
 
 
 @pytest.mark.parametrize(("electrons", "darks"), [(200, 0), (2000, 1), (20_000, 4)])
 def test_every_interval_covers_for_every_sample(electrons: float, darks: int) -> None:
     found = list(cells("RGB950's 40", darks, electrons, PIXELS, extra=EXTRA))
-    tight = [c for c in found if c.quantity not in LOOSE]
-    low = [c for c in tight if c.in_95 < LEAST_95 or c.in_68 < LEAST_68]
+    low = [c for c in found if c.in_95 < LEAST_95 or c.in_68 < LEAST_68]
     # 800 cells: two in a thousand are beyond three standard deviations by chance.
     assert len(low) <= 4, low
     assert all(c.in_95 > 0.85 for c in found), min(found, key=lambda c: c.in_95)
@@ -117,6 +114,41 @@ def test_intervals_of_eigenvalues_cover_at_every_gap(
     in_68, in_95 = np.abs(off) <= found.half, (off <= found.below) & (off >= -found.above)
     assert in_68.mean(axis=1) == pytest.approx(np.full(3, 0.68), abs=off_68)
     assert in_95.mean(axis=1) == pytest.approx(np.full(3, 0.95), abs=off_95)
+
+
+@pytest.mark.parametrize(("components", "off_68", "off_95"), [(8.0, 0.05, 0.035), (3.0, 0.06, 0.04), (1.5, 0.08, 0.04)])
+@pytest.mark.parametrize("true", [(0, 0, 0), (30, 30, 30), (30, 30, -30), (3, 3, 0), (8, 2, 1), (30, 20, 10)])
+def test_intervals_of_singular_values_cover_at_every_gap(
+    true: tuple[float, ...], components: float, off_68: float, off_95: float
+) -> None:
+    """Those of equal ones covered 97 to 100 %, with a bias of their own error."""
+    random = np.random.default_rng(3)
+    seen, own = (part.T for part in singular_values(np.array(true), random, blocks(components, random, 10_000, 9)))
+    found = of_singular_values(seen, own, np.ones(10_000), components)
+    off = seen + found.middle - np.array(true)[:, None]
+    in_68, in_95 = np.abs(off) <= found.half, (off <= found.below) & (off >= -found.above)
+    assert in_68.mean(axis=1) == pytest.approx(np.full(3, 0.68), abs=off_68)
+    assert in_95.mean(axis=1) == pytest.approx(np.full(3, 0.95), abs=off_95)
+
+
+@pytest.mark.parametrize("quantity", ["symmetric_d1", "symmetric_d2", "symmetric_d3", "eigenvalue_deviation"])
+def test_sorted_numbers_have_intervals_and_pulls_within_the_limits(quantity: str) -> None:
+    """Elements of the symmetric decomposition covered 96 to 100 %; pulls of deviations over an even error were 1.3."""
+    mine = [c for c in cells("RGB950's 40", 1, 20_000, 1000, extra=EXTRA) if c.quantity == quantity]
+    assert len(mine) >= 12
+    # The table is smooth: the smaller two of three equal ones cover 97 to 99 %.
+    assert sum(verdicts(c, 1000)[:2] == ("in", "in") for c in mine) >= 9
+    assert not any("low" in verdicts(c, 1000) for c in mine)
+    assert all(0.65 < c.rms < 1.15 for c in mine)
+
+
+@pytest.mark.parametrize(("electrons", "sample"), [(2000, "det < 0"), (200, "polarizer 1:10")])
+def test_noise_across_a_short_vector_is_no_error_of_its_length(electrons: float, sample: str) -> None:
+    """The error was 0.55 of the noise across at least: 68 % intervals covered 98 %, and pulls were 0.33."""
+    found = cells("127 degrees, 9 to 1, 41", 1, electrons, 1000, samples=[sample], extra=())
+    cell = next(c for c in found if c.quantity == "depolarization_index")
+    assert 0.6 < cell.in_68 < 0.9
+    assert cell.rms > 0.6
 
 
 def test_over_an_intensity_below_zero_a_length_has_no_interval() -> None:
@@ -220,7 +252,7 @@ def test_an_axis_that_is_not_determined_has_its_whole_period_about_its_value() -
     """That of the differential decomposition had 0 to 180 degrees, which counts as a miss where it passes 180."""
     found = cells("127 degrees, 9 to 1, 41", 0, 60, 200, samples=["retarder 2"], first_seed=21)
     cell = next(c for c in found if c.quantity == "differential_retardance_fast_axis_deg")
-    assert cell.everything > 0.9
+    assert cell.all_95 > 0.9
     assert cell.in_95 > 0.95
 
 
@@ -244,5 +276,5 @@ def test_poor_states_have_intervals_that_cover_too(instrument: str) -> None:
     found = list(
         cells(instrument, 0, 20_000, PIXELS, samples=["triply degenerate", "retarder 90", "mirror-like"], extra=())
     )
-    low = [c for c in found if c.quantity not in LOOSE and (c.in_68 < LEAST_68 or c.in_95 < LEAST_95)]
+    low = [c for c in found if c.in_68 < LEAST_68 or c.in_95 < LEAST_95]
     assert len(low) <= 3, low
