@@ -64,6 +64,7 @@ def test_the_link_and_the_bits_of_the_camera(acquire, changed, camera, detector,
     assert words in _line(out, "camera")
     assert code == (0 if "frames lost" in words else 1)
     if code == 0:
+        assert "counts in steps of 1 up to 4095" in _line(out, "camera")
         assert "packets of 65534 bytes, lo takes up to 65536" in out
 
 
