@@ -3,9 +3,10 @@
 115200 8N1, commands that end in CR, answers ``WL=550.000`` and the prompt ``>`` without an echo. A KURIOS-VB1 blocks
 light in the band BLACK; other heads make dark with a shutter.
 
-Sources: user guide of the KURIOS-VB1, rev. G of 2019, pages 17 to 22 (baud rate, prompt, CMD_NOT_DEFINED, ``*idn?``,
-``SP?``, ``OH?``, bands); the public driver of plico_motor_server (``WL``, ``ST?``). Unverified: everything on hardware;
-the number of ``OM=1`` (manual), which is that of a public program.
+Documents: user guide of the KURIOS-VB1, rev. G of 2019, pages 17 to 22 (baud rate, prompt, CMD_NOT_DEFINED, ``*idn?``,
+``SP?``, ``OH?``, bands); Thorlabs' serial example (github.com/Thorlabs/Light_Control_and_Manipulation_Examples,
+C#/KURIOS): ``ST?`` (0 initialization, 1 warm-up, 2 ready), ``OM=1`` (manual), ``WL``, ``BW``. Unverified: everything on
+hardware.
 """
 
 import re
