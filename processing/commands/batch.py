@@ -244,7 +244,7 @@ def captures_and(products: Iterable[str]) -> Callable[[Path], bool]:
 
 
 def _capture_is_near(product: Path) -> bool:
-    """Whether the capture of NAME.mueller.h5 is in the folder: the command then starts from that."""
+    """Whether the capture of NAME.KIND.h5 is in the folder: the command then starts from that."""
     words = product.name.split(".")
     return any(product.with_name(f"{'.'.join(words[:k])}.h5").exists() for k in range(1, len(words) - 1))
 

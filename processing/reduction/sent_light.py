@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import BoolArray
-from processing.instrument.determined_basis import determined_elements
+from processing.instrument.determined_basis import ALIKE, determined_elements
 from processing.reduction.solvers.base import Solver
 from processing.reduction.solvers.inversion import Inversion
 from processing.reduction.solvers.plain import LEAST
@@ -21,8 +21,6 @@ PLANES = {
     "stokes": Plane((4,), "count", "Stokes vector S0 to S3 that the sample sends back for the light that it gets"),
     "stokes_errors": Plane((4,), "count", "standard errors of stokes"),
 }
-#: Relative difference of generator states that is rounding of what the axes read.
-ALIKE = 1e-6
 
 
 def light_of(w: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ from typing import Any
 
 from processing.calibration.photon_transfer import read_camera
 from processing.errors import ProcessError
+from processing.instrument.determined_basis import has_one_light
 from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.exclusions import Exclusions
 from processing.reduction.flat import flat_captures, nearest_flat
@@ -16,7 +17,7 @@ from processing.reduction.mueller_reduction import Choice
 from processing.steps.file_step import FileStep, Progress, StepProduct
 from processing.storage.captures.capture import Capture
 from processing.storage.products.product import is_product
-from processing.storage.products.provenance import Step, file_identity
+from processing.storage.products.provenance import Step, file_identity, made_of
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,14 @@ class Reduction(FileStep):
 
     @property
     def usual_path(self) -> Path:
-        """Beside the capture."""
-        return self.capture.with_suffix(f".{self.kind}.h5")
+        """Beside the capture; an earlier version called the product of a turning plate `NAME.mueller.h5`."""
+        with Capture(self.capture) as capture:
+            kind = capture.reduces_to
+            is_stokes = kind == "mueller" and has_one_light(choose_model(capture, self.instrument))
+        path = self.capture.with_suffix(f".{kind}.h5")
+        if not is_stokes or (path.is_file() and made_of(path) == self.record().made_of):
+            return path
+        return self.capture.with_suffix(".stokes.h5")
 
     def record(self) -> Step:
         """Options and contents; the capture's name is among the options, for effects of single captures go by it."""
@@ -131,7 +138,7 @@ class Reduction(FileStep):
                     progress=progress,
                 )
                 return
-            # Imported here: OpenCV is not needed for a Mueller capture.
+            # Imported here: a Mueller capture needs none of it.
             from processing.reduction.mosaic.pixel_response import read_response
             from processing.reduction.stokes import reduce_stokes
 

@@ -253,7 +253,7 @@ def test_two_beams_on_one_sensor(tmp_path, process):
     with Capture(out) as capture:
         assert (capture.channel_names, capture.frame_shape) == (("o", "e"), (4, 6))
     assert process("reduce", out, "--no-figure")[0] == 0
-    s = MuellerImage.load(out.with_suffix(".mueller.h5")).values[:, 0].mean(axis=(1, 2))
+    s = MuellerImage.load(out.with_suffix(".stokes.h5")).values[:, 0].mean(axis=(1, 2))
     assert s[:3] / s[0] == pytest.approx(light[:12:4], abs=2e-3)
 
 
@@ -286,8 +286,14 @@ def test_a_stokes_polarimeter_of_twelve_states(configs, tmp_path, process, kind)
     instrument = ("--instrument", configs / "instruments" / "rotating_retarder_stokes.yaml")
     assert process("import", *given, *instrument, "--wavelength-nm", 532, "--out", out)[0] == 0
     assert process("reduce", out, "--no-figure")[0] == 0
-    image = MuellerImage.load(out.with_suffix(".mueller.h5"))
+    product = out.with_suffix(".stokes.h5")
+    image = MuellerImage.load(product)
     assert image.values[:, 0].mean(axis=(1, 2)) / image.values[0, 0].mean() == pytest.approx(SAMPLE[:, 0], abs=2e-3)
+    former = product.rename(out.with_suffix(".mueller.h5"))
+    for command in ("reduce", "quantities"):
+        code, said, _ = process(command, out, "--no-figure")
+        assert (code, product.exists()) == (0, False)
+        assert former.name in said
 
 
 def mueller_of(process, capture):
