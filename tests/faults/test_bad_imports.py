@@ -1,6 +1,7 @@
 """Promise 20 for what comes from other labs: states files, pictures, stacks, measured tensors."""
 
 import struct
+import sys
 import zlib
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 
 from processing.doors import MOST_PIXELS, ProcessError, require_picture
 from processing.reflectance.pbsdf import load as load_pbsdf
+from processing.storage.formats.frame_files import read_frame
 from processing.storage.formats.tensor_file import create_tensor_file
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -107,6 +109,17 @@ def test_picture_cut_short(states, tmp_path, process_refuses):
     whole.write_bytes(whole.read_bytes()[:-30])
     arguments = ("--states", states(), "--wavelength-nm", 662, "--instrument", INSTRUMENT)
     assert "f3.png" in process_refuses("import", *arguments)
+
+
+@pytest.mark.parametrize("frame", [np.full((4, 6, 3), 4000, np.uint16), np.full((4, 6), 70000, np.int32)])
+def test_pictures_that_only_opencv_reads_as_they_are(frame, tmp_path, monkeypatch):
+    cv2.imwrite(str(tmp_path / "deep.tif"), frame)
+    read = read_frame(tmp_path / "deep.tif")
+    assert read.dtype == frame.dtype
+    assert np.array_equal(read, frame.reshape(4, 6, -1)[..., 0])
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(ProcessError, match=r"needs cv2: pip install 'umov\[fast\]'"):
+        read_frame(tmp_path / "deep.tif")
 
 
 def _stack_h5(path):
