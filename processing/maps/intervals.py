@@ -376,6 +376,8 @@ def set_differential(planes: Planes, is_determined: NDArray[np.bool_]) -> None:
 
 def set_any_dominant(planes: Planes, derived: Mapping[str, Derived], is_determined: NDArray[np.bool_]) -> None:
     """Every process is in the intervals where the dominant one is not determined. The others are done."""
+    if is_determined.all():
+        return
     for name in [n for n in derived if n.startswith("dominant_")]:
         value = np.where(is_determined, planes[name], derived[name].value)
         error = planes[f"{name}_errors"]
