@@ -3,9 +3,10 @@
 Documents: OWIS' libraries ps90.dll (1.0.9.1, 2014, with ps90.h and the example ps90tool.c) and ps10.dll (with
 ps10func.cs, 2016). Every command of this driver is a string in both, and on the wire ps90.dll ends it with CR.
 The meaning of a letter of ``?ASTAT`` is the result of their GetAxisState, GetMoveState and GetErrorState: ready, off,
-one of eleven motions, one of seven errors. The words of the errors, and what the modes of REF do, come from public
-copies of the manual. A home counts where it ended at zero, and its motion was seen (P) or GetRefReady (`?REFST`)
-answers 1. Speed and limits have units that are not documented: the rig file says the speed.
+one of eleven motions, one of seven errors. They take every letter outside their lists for ready, this driver R alone.
+The words of the errors, and what the modes of REF do, come from public copies of the manual. A home counts where it
+ended at zero, and its motion was seen (P) or GetRefReady (`?REFST`) answers 1. Speed and limits have units that
+are not documented: the rig file says the speed.
 Unverified on hardware: everything.
 """
 
