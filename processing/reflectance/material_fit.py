@@ -236,13 +236,13 @@ def _fit_correlation(reference: _Correlation, moved: Sequence[_Correlation]) -> 
     for change in _departures(reference.model.mueller(constants).reshape(-1, 16)):
         extra = reference.polarized(reference.light[:, None] * np.einsum("nki,ni->nk", reference.rows, change))
         extra -= unit * np.sum(unit * extra, axis=1, keepdims=True)
-        departures.append(np.einsum("nkp,nk->p", slopes, extra))
+        departures.append(reference.model.fields @ np.einsum("nkp,nk->np", slopes, extra))
         unlike += float(np.sum(extra**2))
     square, free = unexplained_square(residual, changes), residual.size - 2 * len(residual) - 4
     # Eigenvalues may differ by more than usual: by as much as makes the residual.
     more = max(1.0, float(np.sqrt(max(square - free, 0) / unlike)))
     scores, curvature = np.einsum("nkp,nk->np", slopes, residual), jacobian.T @ jacobian
-    method, apart = "linear correlation", more * np.array(departures)
+    method, apart = "linear correlation", more * np.concatenate(departures)
     result = result_of(
         constants, curvature, scores, square, free=free, method=method, off=off, departures=apart, of=DIFFUSE
     )
@@ -257,6 +257,11 @@ class _Forward:
         self.via_s, self.via_p = fresnel.basis(geometry)
         self.theta_d, self.sine = geometry.angles.theta_d, np.sin(geometry.angles.theta_h)
         self.diffuse = polarized_diffuse.diffuse_jones(geometry)
+        #: Fields (10, N) over the surface, whose squares add up to 1: a random field with weights of unit variance.
+        # Small eigenvalues that were the same over the whole surface would hardly look like other constants.
+        x, y, z = np.moveaxis(geometry.normal, -1, 0)
+        second = np.array([x * x, y * y, z * z, *(np.sqrt(2) * p for p in (x * y, y * z, z * x))])
+        self.fields = np.concatenate([[np.ones_like(x), x, y, z], second]) / np.sqrt(3)
 
     def mueller(self, p: Array) -> Array:
         n, k, a, b = p
