@@ -30,6 +30,8 @@ from simulators.bench.scene import Scene
 from simulators.bench.virtual_capture import write_virtual_capture
 
 ANGLES = (35.0, 60.0)
+#: dask warns where a disc is slow, which another program can make it.
+SLOW_DISC = pytest.mark.filterwarnings("ignore:Creating scratch directories")
 
 
 @pytest.fixture(scope="module")
@@ -224,6 +226,7 @@ def test_noise_of_psi_and_magnitude_explains_no_more_than_there_is(here):
         assert 0 < row.magnitude_noise_percent < 1.1 * row.magnitude_percent
 
 
+@SLOW_DISC
 def test_a_cluster_gives_the_same_numbers(folder, here, configs, tmp_path):
     distributed = pytest.importorskip("distributed")
     files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
@@ -235,6 +238,7 @@ def test_a_cluster_gives_the_same_numbers(folder, here, configs, tmp_path):
     assert here.rows == there.rows
 
 
+@SLOW_DISC
 @pytest.mark.long
 def test_a_cluster_survives_a_capture_that_fails_and_a_worker_that_dies(configs, tmp_path):
     distributed = pytest.importorskip("distributed")
