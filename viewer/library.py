@@ -3,7 +3,7 @@
 import json
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
 from pathlib import Path
@@ -114,10 +114,14 @@ class Library:
         """Whether there is a file of that path and it lies in the folder; links are followed."""
         return path.is_file() and path.resolve().is_relative_to(self.root)
 
-    def entries(self) -> list[Entry]:
-        """Every HDF5 file, newest first."""
+    def entries(self, say: Callable[[str], None] | None = None) -> list[Entry]:
+        """Every HDF5 file, newest first; `say` is called with the name of each before it is read."""
+        candidates: list[Entry | None] = []
         with self._lock:
-            candidates = [self._entry(path) for path in self._files(".h5", f".h5{PARTIAL}")]
+            for path in self._files(".h5", f".h5{PARTIAL}"):
+                if say is not None:
+                    say(f"{len(candidates) + 1}: {path.name}")
+                candidates.append(self._entry(path))
             if self._read_anew >= READ_ANEW:
                 self._save_index()
         # A link has the name of the file that it leads to, which is listed once.

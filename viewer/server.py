@@ -11,6 +11,7 @@ from pathlib import Path
 import typer
 import uvicorn
 
+from processing.commands.progress_bar import progress_line
 from processing.errors import ProcessError
 from viewer.application import application
 
@@ -25,6 +26,10 @@ def serve(folder: Path, port: int, browser: bool) -> None:
         listener = socket.create_server(("127.0.0.1", port), backlog=64)
     except OSError as error:
         raise ProcessError(f"port {port} cannot be had ({error.strerror}); leave --port away for any other.") from error
+    app = application(folder, token)
+    # Thousands of new captures take a minute, in which the first page would be blank.
+    with progress_line("reading new files", verbose=False) as say:
+        app.state.pages.library.entries(say)
     address = f"http://127.0.0.1:{listener.getsockname()[1]}/{token}/"
     typer.echo(f"view: {address}")
     typer.echo("Ctrl-C ends it; runs started from the page continue.", err=True)
@@ -34,9 +39,7 @@ def serve(folder: Path, port: int, browser: bool) -> None:
     resource.setrlimit(resource.RLIMIT_NOFILE, (limit if limit != resource.RLIM_INFINITY else 1 << 16, limit))
     way_in = _open_in_browser(address) if browser else None
     # Addresses hold the token, so no request is ever logged.
-    settings = uvicorn.Config(
-        application(folder, token), log_level="warning", access_log=False, timeout_graceful_shutdown=1, lifespan="off"
-    )
+    settings = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=1, lifespan="off")
     try:
         uvicorn.Server(settings).run(sockets=[listener])
     finally:

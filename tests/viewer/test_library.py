@@ -69,6 +69,13 @@ def test_a_second_start_reads_no_file_again(lab, drr_capture, monkeypatch):
     assert len(viewer.library.Library(lab).entries()) == MOST + 1
 
 
+def test_files_are_named_while_they_are_read(lab, drr_capture):
+    drr_capture("one.h5")
+    lines: list[str] = []
+    viewer.library.Library(lab).entries(lines.append)
+    assert lines == ["1: one.h5"]
+
+
 def test_three_thousand_captures_have_their_first_page_in_a_second(lab, drr_capture, monkeypatch):
     path = drr_capture("one.h5")
     (known,) = viewer.library.Library(lab).entries()
