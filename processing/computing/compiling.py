@@ -33,27 +33,27 @@ else:
 
 
 def compiled(plain: Callable[..., Any] | None = None, **options: Any) -> Callable[[Any], Any]:
-    """Decorator of a loop: it is compiled, or replaced by `plain`, which takes and fills the same arrays.
+    """Decorator that compiles a loop, or replaces it by `plain` where numba is not installed.
 
-    Without `plain` it is called by other loops alone. `options` are those of `numba.njit`; the loop's `plain` stays in
-    sight for tests.
+    `plain` takes and fills the same arrays. A loop that only other loops call needs none. `options` are those of
+    `numba.njit`. A compiled loop has its `plain` as an attribute, so that a test can compare both.
     """
 
     def chosen(loop: Any) -> Any:
         if njit is None:
             return plain or loop
-        made = njit(cache=True, nogil=True, **options)(loop)
-        made.plain = plain
-        return made
+        fast = njit(cache=True, nogil=True, **options)(loop)
+        fast.plain = plain
+        return fast
 
     return chosen
 
 
 def in_parts(at_once: Callable[..., None]) -> Callable[..., None]:
-    """Of `at_once(*arrays, part)`, the same of a range `(*arrays, start, stop)`, part after part."""
+    """Turn `at_once(*arrays, part)` into a function of `(*arrays, start, stop)` that takes `PART` pixels at a time."""
 
-    def all_parts(*words: Any) -> None:
-        *arrays, start, stop = words
+    def all_parts(*arguments: Any) -> None:
+        *arrays, start, stop = arguments
         for first in range(start, stop, PART):
             at_once(*arrays, slice(first, min(first + PART, stop)))
 

@@ -237,8 +237,8 @@ def _scaled(m: Array, pixels: int) -> tuple[NDArray[np.complex128], Array]:
 
 def _processes(vectors: NDArray[np.complex128], scale: Array) -> Array:
     """Mueller-Jones matrices (16, pixels) of eigenvectors (pixels, 4)."""
-    found = from_jones(vectors.reshape(-1, 2, 2)).reshape(-1, 16).T
-    return np.where(scale > 0, found / found[0], np.nan)
+    mueller = from_jones(vectors.reshape(-1, 2, 2)).reshape(-1, 16).T
+    return np.where(scale > 0, mueller / mueller[0], np.nan)
 
 
 def _dominant_at_once(m: Array, pixels: int, xi0: Array, out: Array) -> None:
@@ -261,8 +261,8 @@ def _dominant_at_once(m: Array, pixels: int, xi0: Array, out: Array) -> None:
     values, vectors = np.linalg.eigh(a[unsure])
     x[unsure], projector[unsure] = values[:, 3], vectors[..., 3:] @ np.conj(np.swapaxes(vectors[..., 3:], 1, 2))
     xi0[:pixels] = 0.25 + scale * x
-    found = coherency_to_mueller(projector).reshape(-1, 16).T
-    out[:, :pixels] = np.where(scale > 0, found / found[0], np.nan)
+    mueller = coherency_to_mueller(projector).reshape(-1, 16).T
+    out[:, :pixels] = np.where(scale > 0, mueller / mueller[0], np.nan)
 
 
 def _eigenvalues_at_once(m: Array, pixels: int, xi: Array) -> None:

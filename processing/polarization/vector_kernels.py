@@ -241,8 +241,8 @@ def _lengths_at_once(table: Array, nodes: tuple[Array, ...], given: Array, out: 
         length, along, total, square, below, above = given[:, part]
         unit, components, farthest = np.sqrt(square / total), total * total / square, nodes[2][-1]
         seen = length / unit
-        known = np.isfinite(seen) & (seen >= 0) & np.isfinite(components) & np.isfinite(along)
-        seen, near = np.where(known, seen, 0.0), seen < farthest
+        valid = np.isfinite(seen) & (seen >= 0) & np.isfinite(components) & np.isfinite(along)
+        seen, near = np.where(valid, seen, 0.0), seen < farthest
         (i, x), (k, z) = _places(components, nodes[0]), _places(seen, nodes[2])
         far, ends = np.sqrt(np.maximum(seen * seen - components + along / unit**2, 1.0)), []
         for n, variance in enumerate((along, along, below, above)):
@@ -262,8 +262,8 @@ def _lengths_at_once(table: Array, nodes: tuple[Array, ...], given: Array, out: 
         for side, end, variance in ((-1, low_95, below), (1, high_95, above)):
             half = _narrower(side * (end - value), DEVIATES[1], variance / unit**2, first)
             outer.append(np.where(narrow & (end > 0), value + side * half, end))
-        found = np.stack([value, error, np.maximum(outer[0], 0.0), outer[1]]) * unit
-        out[:, part] = np.where(known, found, np.nan)
+        interval = np.stack([value, error, np.maximum(outer[0], 0.0), outer[1]]) * unit
+        out[:, part] = np.where(valid, interval, np.nan)
 
 
 @compiled(_lengths_at_once, error_model="numpy")
@@ -331,8 +331,8 @@ def _interpolate_at_once(table: Array, places: Array, out: Array) -> None:
         last = np.array(table.shape[:3])[:, None] - 1
         inside = np.minimum(places[:, part], last)
         node = np.minimum(inside.astype(int), last - 1)
-        words = [w for i, x in zip(node, (inside - node)[..., None], strict=True) for w in (i, x)]
-        out[:, part] = _mixed(table, *words).T
+        places_in_cells = [w for i, x in zip(node, (inside - node)[..., None], strict=True) for w in (i, x)]
+        out[:, part] = _mixed(table, *places_in_cells).T
 
     each(0, places.shape[1])
 

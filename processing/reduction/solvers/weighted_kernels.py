@@ -93,7 +93,7 @@ def _take_tile(normal, a, first, count):  # type: ignore[no-untyped-def]
 
 
 @in_parts
-def _at_once(normal: Array, right: Array, solution: Array, covariance: Array, part: slice) -> None:
+def _solve_at_once(normal: Array, right: Array, solution: Array, covariance: Array, part: slice) -> None:
     row, column = np.tril_indices(ELEMENTS)
     full = np.empty((normal[:, part].shape[1], ELEMENTS, ELEMENTS))
     full[:, row, column] = full[:, column, row] = normal[:, part].T
@@ -117,7 +117,7 @@ def _is_singular(full: Array) -> NDArray[np.bool_]:
     return bad
 
 
-@compiled(_at_once, **_EXACT)
+@compiled(_solve_at_once, **_EXACT)
 def solve_range(normal, right, solution, covariance, start, stop):  # type: ignore[no-untyped-def]
     """Solve normal . solution = right for pixels start..stop; covariance = inverse of normal, packed.
 

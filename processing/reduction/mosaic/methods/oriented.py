@@ -175,8 +175,8 @@ def _everywhere_at_once(columns: Image, kernel: Image, out: Image, first: int, l
         for row, column in np.ndindex(2, 2):
             part = np.s_[start + row : min(start + _ROWS_AT_ONCE, last) : 2, column::2]
             values = around[part]
-            found = values.reshape(-1, kernel.shape[2]) @ kernel[row, column]
-            out[:, *part] = found.T.reshape(-1, *values.shape[:2])
+            mean = values.reshape(-1, kernel.shape[2]) @ kernel[row, column]
+            out[:, *part] = mean.T.reshape(-1, *values.shape[:2])
 
 
 @compiled(_everywhere_at_once, **_FAST)
