@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.apt_frames import apt_framer
-from drivers.axes import apt, esp301, gcs2, gsc, lcc25, owis, smc100, zaber
+from drivers.axes import apt, esp301, gcs2, gsc, lcc25, smc100, zaber
 from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
 from drivers.serial_link import LONGEST_FRAME, LineRegistry, line_framer
 from simulators.clock import FastClock, patient_clock
@@ -74,74 +74,6 @@ def test_an_lcc25_is_woken_by_an_empty_line() -> None:
         LineRegistry(clock=patient_clock()) as lines,
     ):
         lcc25.open("lcr", lcc25.Config(port=path), lines)._do_start_move(1.53)
-
-
-def test_owis_makes_an_axis_ready_before_it_goes() -> None:
-    def at(letters: bytes) -> tuple[bytes, bytes]:
-        return b"?ASTAT\r", letters + b"\r"
-
-    with (
-        scripted(
-            (b"?VERSION\r", b"PS90-V6.2-240219\r"),
-            *[at(b"RO")] * 2,
-            at(b"RO"),
-            (b"INIT2\r", b""),
-            at(b"RO"),
-            at(b"RR"),
-            (b"ABSOL2\rPSET2=-4500\rPGO2\r", b""),
-            *[at(b"RT")] * 2,
-            (b"STOP2\r", b""),
-            *[at(b"RL")] * 2,
-        ) as path,
-        LineRegistry(clock=patient_clock()) as lines,
-    ):
-        entry = owis.Config(port=path, axis=2, counts_per_deg=100, speed_deg_s=10, assume_homed=True)
-        axis = owis.open("psa", entry, lines)
-        axis._do_start_move(-4500.0)
-        assert axis.is_moving()
-        axis.stop()
-        with pytest.raises(CommandRejected, match="disabled at a limit switch"):
-            axis.check_fault()
-
-
-@pytest.mark.parametrize(
-    ("seen", "ends_at", "homed"),
-    [(b"P", b"0", True), (b"P", b"3200", False), (b"R", b"0", False), (b"R", b"0", True)],
-)
-def test_an_owis_home_ends_at_zero_and_was_seen(seen: bytes, ends_at: bytes, homed: bool) -> None:
-    at, count = (b"?ASTAT\r", b"R\r"), (b"?CNT1\r", ends_at + b"\r")
-    with (
-        scripted(
-            (b"?VERSION\r", b"PS10-V6.2-240219\r"),
-            *[at] * 4,
-            (b"REF1=4\r", b""),
-            *[(b"?ASTAT\r", seen + b"\r")] * 2,
-            *[at] * 2,
-            *[count] * 2,
-            at,
-            *[(b"?REFST1\r", b"%d\r" % homed)] * (2 * (seen == b"R")),
-        ) as path,
-        LineRegistry(clock=patient_clock()) as lines,
-    ):
-        axis = owis.open("psa", owis.Config(port=path, counts_per_deg=100, speed_deg_s=10), lines)
-        axis._do_start_home()
-        assert axis.is_moving() is (seen == b"P")
-        assert axis.is_homed() is homed
-
-
-@pytest.mark.parametrize("letter", "LBAMZHE")
-def test_what_owis_takes_for_an_error_is_no_motion(letter: str) -> None:
-    state = (b"?ASTAT\r", letter.encode() + b"\r")
-    with (
-        scripted((b"?VERSION\r", b"PS90-V6.2-240219\r"), *[state] * 6) as path,
-        LineRegistry(clock=patient_clock()) as lines,
-    ):
-        axis = owis.open("psa", owis.Config(port=path, counts_per_deg=100, speed_deg_s=10), lines)
-        assert not axis.is_moving()
-        with pytest.raises(CommandRejected, match=owis.FAULTS[letter]):
-            axis.check_fault()
-    # The two lists of ps90.dll and ps10.dll (GetErrorState, GetMoveState).
-    assert (set(owis.FAULTS), owis.MOVING) == (set("LBAMZHE"), set("TSPFVJWXYCN"))
 
 
 def test_the_speed_of_a_conex_agp_is_that_of_the_rig_file() -> None:

@@ -345,24 +345,6 @@ def test_a_gsc_02_is_silent_and_must_be_told_the_way_home() -> None:
     assert talk(box, b"Q:\r\n") == b"       400,-      800,K,K,R\r\n"
 
 
-def test_owis_states_and_targets() -> None:
-    unit, clock = emulator("owis", axes=2)
-    assert talk(unit, b"?VERSION\r").startswith(b"PS90")
-    # Off; a target that is set is not gone to.
-    assert talk(unit, b"?ASTAT\r") == b"OO\r"
-    assert talk(unit, b"PSET1=5000\rPGO1\r?ASTAT\r") == b"OO\r"
-    assert talk(unit, b"INIT1\r?ASTAT\r") == b"RO\r"
-    assert talk(unit, b"REF1=4\r?ASTAT\r") == b"PO\r"
-    clock.sleep_s(60.0)
-    assert talk(unit, b"PGO1\r?ASTAT\r") == b"TO\r"
-    clock.sleep_s(60.0)
-    assert talk(unit, b"?CNT1\r?PSET1\r") == b"5000\r5000\r"
-    assert talk(unit, b"RELAT1\rPSET1=-1000\rPGO1\r") == b""
-    clock.sleep_s(60.0)
-    assert unit.true_deg(0) == 4.0
-    assert talk(unit, b"?CNT9\rPGO\rnonsense\r") == b""
-
-
 def test_a_conex_agp_knows_no_speed() -> None:
     box, _ = emulator("conex-agp")
     assert talk(box, b"1VE\r\n").startswith(b"1VE CONEX-AGP")
@@ -371,7 +353,6 @@ def test_a_conex_agp_knows_no_speed() -> None:
 
 QUESTIONS = {
     "gsc-01": b"Q:\r\n",
-    "owis": b"?ASTAT\r",
     "zaber": b"/1 1 07 get limit.max\n",
     "elliptec": b"1gp",
     "smc100": b"1TS\r\n",
