@@ -11,11 +11,10 @@ nothing has no reason to be one. Seeds below 1000 are for development.
 
 import argparse
 import importlib
-import json
+import multiprocessing
 import os
-import subprocess
-import sys
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
@@ -23,6 +22,7 @@ from typing import Any
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import numpy as np
+from real_benches import seeds as seeds_of
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Modules whose public numbers decide.
@@ -41,7 +41,9 @@ def numbers() -> dict[str, str]:
 
 
 def change(name: str, factor: float) -> None:
-    """Change a number before any other module has read it."""
+    """Change a number before any other module has read it; without a name, none."""
+    if not name:
+        return
     module = importlib.import_module(numbers()[name])
     value = getattr(module, name)
     changed = value * factor
@@ -74,11 +76,8 @@ def judge_in_process(
     folder: Path, seeds: Sequence[int], capture_set: str, name: str = "", *, factor: float = 1.0
 ) -> list[dict[str, Any]]:
     """The same in a new process, which reads the changed number."""
-    command = [sys.executable, __file__, name, "--child", str(folder), "--factor", str(factor), "--given", capture_set]
-    done = subprocess.run(
-        [c for c in (*command, "--seeds", ",".join(map(str, seeds))) if c], capture_output=True, text=True, check=True
-    )
-    return list(json.loads(done.stdout.splitlines()[-1]))
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), change, (name, factor)) as process:
+        return process.submit(judge_benches, folder, seeds, capture_set).result()
 
 
 def row(now: Sequence[dict[str, Any]], plain: Sequence[dict[str, Any]]) -> str:
@@ -104,27 +103,18 @@ def lines(names: Sequence[str], folder: Path, seeds: Sequence[int], capture_set:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", help="numbers to change; default: all")
-    parser.add_argument("--seeds", default="1-6", help="as 1-6,9")
+    parser.add_argument("--seeds", type=seeds_of, default=seeds_of("1-6"), help="as 1-6,9")
     parser.add_argument("--given", default="sphere", help="captures that are diagnosed: sphere or joint")
     parser.add_argument("--pixels", type=int, default=32)
-    parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--factor", type=float, default=1.0, help=argparse.SUPPRESS)
     options = parser.parse_args()
-    spans = [part.partition("-") for part in options.seeds.split(",")]
-    seeds = [n for first, _, last in spans for n in range(int(first), int(last or first) + 1)]
     if unknown := set(options.names) - set(numbers()):
         parser.error(f"no such number: {', '.join(sorted(unknown))}; there are: {', '.join(sorted(numbers()))}")
-    if options.child:
-        for name in options.names:
-            change(name, options.factor)
-        print(json.dumps(judge_benches(options.child, seeds, options.given)))
-        return
     from simulators.blind.real_bench import make_bench
 
     folder = Path(mkdtemp(prefix="ablate_"))
-    for seed in seeds:
+    for seed in options.seeds:
         make_bench(folder, seed, ROOT / "configs", "real", pixels=options.pixels)
-    for line in lines(options.names or sorted(numbers()), folder, seeds, options.given):
+    for line in lines(options.names or sorted(numbers()), folder, options.seeds, options.given):
         print(line, flush=True)
 
 

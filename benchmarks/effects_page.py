@@ -4,6 +4,7 @@ PYTHONPATH=. python benchmarks/effects_page.py
 """
 
 import inspect
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
@@ -86,8 +87,6 @@ class Described:
 
 def wrapped(text: str) -> str:
     """Lines of at most 120 characters."""
-    import textwrap
-
     return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)
 
 

@@ -1,5 +1,6 @@
 """What honest error bars cost: xi0 and all quantities with first-order error bars alone, a table without any."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
@@ -36,6 +37,11 @@ def _image() -> MuellerImage:
     return noisy_image(np.tile(matrix, (PIXELS, 1, 1)), 2000.0, 1)
 
 
+def _against(peer: str, without: Callable[[], object], name: str, ours: Callable[[], object]) -> Task:
+    """A task that may take `AT_MOST` of the time of the same `without` honest error bars."""
+    return Task(name, None, ours, {peer: lambda: seconds(without)}, (peer, AT_MOST))
+
+
 def xi0() -> Task:
     """`process xi0`: noise taken off, intervals that cover."""
     image = _image()
@@ -46,28 +52,22 @@ def xi0() -> Task:
         found = gradients.coherency(fresh.matrices.astype(float))["coherency_eigenvalues"]
         np.sqrt(fresh.variance_of(found.gradient[0]))
 
-    task = Task(f"xi0 with intervals, {PIXELS} pixels", None, lambda: eigenvalue_block(replace(image)))
-    task.peers["first order alone"] = lambda: seconds(first_order)
-    task.at_most = ("first order alone", AT_MOST)
-    return task
+    name = f"xi0 with intervals, {PIXELS} pixels"
+    return _against("first order alone", first_order, name, lambda: eigenvalue_block(replace(image)))
 
 
 def all_quantities() -> Task:
     """`process quantities`: noise taken off magnitudes and eigenvalues, an interval in every pixel."""
     image = _image()
 
+    def ours() -> None:
+        quantities.quantities_block(replace(image), (), PAPER_PAIRS)
+
     def first_order() -> None:
         with mock.patch.object(quantities, "_set_intervals"):
-            quantities.quantities_block(replace(image), (), PAPER_PAIRS)
+            ours()
 
-    task = Task(
-        f"all quantities with intervals, {PIXELS} pixels",
-        None,
-        lambda: quantities.quantities_block(replace(image), (), PAPER_PAIRS),
-    )
-    task.peers["first order alone"] = lambda: seconds(first_order)
-    task.at_most = ("first order alone", AT_MOST)
-    return task
+    return _against("first order alone", first_order, f"all quantities with intervals, {PIXELS} pixels", ours)
 
 
 def table(folder: Path) -> Task:
@@ -86,7 +86,4 @@ def table(folder: Path) -> Task:
             step.make(overwrite=True)
 
     name = f"process table with noise and {len(U)} uncertain inputs, {SMALL[0]} x {SMALL[1]}"
-    task = Task(name, None, lambda: step.make(overwrite=True))
-    task.peers["means and variances alone"] = lambda: seconds(means)
-    task.at_most = ("means and variances alone", AT_MOST)
-    return task
+    return _against("means and variances alone", means, name, lambda: step.make(overwrite=True))

@@ -9,7 +9,7 @@ sample does not have (the azimuth of no diattenuation) is left out. Components a
 
 import argparse
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from processing.maps.xi0 import eigenvalue_block
 from processing.polarization.magnitude import NORMAL_95
 from processing.polarization.quantities import PAPER_PAIRS
 from processing.reports.colours import period_deg
+from processing.storage.products.images import MuellerImage
 
 LIGHT = (20.0, 60.0, 200.0, 2000.0, 20_000.0)
 DARKS = (0, 1, 4)
@@ -92,22 +93,7 @@ def cells(
     """Every quantity of every one of the 19 samples, or of those named, seen by one of the seven instruments."""
     matrices = {name: m for name, m in nineteen_samples().items() if not samples or name in samples}
     seed = [first_seed, darks, int(electrons), list(seven_instruments()).index(instrument)]
-    w = {instrument: seven_instruments()[instrument]}
-    yield from cells_of(matrices, w, darks, electrons, pixels=pixels, extra=extra, seed=seed)
-
-
-def cells_of(
-    matrices: Mapping[str, np.ndarray],
-    instrument: Mapping[str, np.ndarray],
-    darks: int,
-    electrons: float,
-    *,
-    pixels: int,
-    extra: Sequence[str],
-    seed: Sequence[int],
-) -> Iterator[Cell]:
-    """The same of samples (4, 4) by name and of one instrument W (N, 16) by name."""
-    ((name_of_w, w),) = instrument.items()
+    w = seven_instruments()[instrument]
     stack = np.stack(list(matrices.values()))
     truth = _planes(noisy_image(stack, BRIGHT, 0, w), extra)
     planes = _planes(noisy_image(np.repeat(stack, pixels, axis=0), electrons, seed, w, darks=darks), extra)
@@ -171,7 +157,7 @@ def cells_of(
             rms = np.sqrt(square.mean()) if pull.size else np.nan
             yield Cell(
                 name,
-                name_of_w,
+                instrument,
                 darks,
                 electrons,
                 sample,
@@ -190,17 +176,13 @@ def cells_of(
             )
 
 
-def _planes(image: object, extra: Sequence[str]) -> dict[str, np.ndarray]:
-    planes = quantities_block(image, tuple(extra), PAPER_PAIRS)  # type: ignore[arg-type]
-    xi0 = eigenvalue_block(image)  # type: ignore[arg-type]
-    return planes | {
-        "mueller": image.values,  # type: ignore[attr-defined]
-        "mueller_errors": image.errors,  # type: ignore[attr-defined]
-        "process xi0": xi0["xi0"],
-        "process xi0_errors": xi0["xi0_errors"],
-        "process xi0_68": xi0["xi0_68"],
-        "process xi0_95": xi0["xi0_95"],
+def _planes(image: MuellerImage, extra: Sequence[str]) -> dict[str, np.ndarray]:
+    planes = quantities_block(image, tuple(extra), PAPER_PAIRS) | {
+        "mueller": image.values,
+        "mueller_errors": image.errors,
     }
+    xi0 = eigenvalue_block(image)
+    return planes | {f"process {name}": xi0[name] for name in ("xi0", "xi0_errors", "xi0_68", "xi0_95")}
 
 
 def verdicts(cell: Cell, pixels: int) -> tuple[str, str, str]:

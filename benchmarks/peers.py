@@ -63,26 +63,20 @@ def pymueller_lu_chipman(m: Any) -> Callable[[], object]:
     return lambda: pymueller.decomposition.lu_chipman(1, len(m), m.reshape(1, len(m), 16).copy())
 
 
-def py_pol_lu_chipman(m: Any) -> Callable[[], object]:
+def _py_pol_sample(m: Any) -> Any:
     from py_pol.mueller import Mueller
 
-    def run() -> None:
-        sample = Mueller("sample")
-        sample.from_matrix(np.moveaxis(m, 0, -1).copy())
-        sample.analysis.decompose_polar(decomposition="PRD")
+    sample = Mueller("sample")
+    sample.from_matrix(np.moveaxis(m, 0, -1).copy())
+    return sample
 
-    return run
+
+def py_pol_lu_chipman(m: Any) -> Callable[[], object]:
+    return lambda: _py_pol_sample(m).analysis.decompose_polar(decomposition="PRD")
 
 
 def py_pol_eigenvalues(m: Any) -> Callable[[], object]:
-    from py_pol.mueller import Mueller
-
-    def run() -> None:
-        sample = Mueller("sample")
-        sample.from_matrix(np.moveaxis(m, 0, -1).copy())
-        np.linalg.eigh(np.moveaxis(sample.covariance_matrix().M, -1, 0))
-
-    return run
+    return lambda: np.linalg.eigh(np.moveaxis(_py_pol_sample(m).covariance_matrix().M, -1, 0))
 
 
 TASKS = {f.__name__: f for f in (

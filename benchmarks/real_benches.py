@@ -81,13 +81,8 @@ def main() -> None:
     tasks = list(product(options.group, options.seeds, options.given))
     named = {name: getattr(options, name) for name in ("instrument", "states", "step_deg", "ratio")}
     polarimeter = {name: value for name, value in named.items() if value is not None}
-    more = {
-        "pixels": options.pixels,
-        "again": options.again,
-        "oracle": not options.no_oracle,
-        "polarimeter": polarimeter,
-    }
-    run = partial(judge_one, folder=options.folder, **more)
+    chosen = {name: getattr(options, name) for name in ("folder", "pixels", "again")}
+    run = partial(judge_one, **chosen, oracle=not options.no_oracle, polarimeter=polarimeter)
     judgements = []
     with ProcessPoolExecutor(options.workers) as workers:
         for k, raw in enumerate(workers.map(run, tasks), 1):

@@ -15,16 +15,8 @@ from processing.computing.threads import for_ranges
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.instrument.states import rotating_retarders
-from processing.reduction.counts_to_signal import BlockReader, CountCorrection
-from processing.reduction.effects_of_capture import capture_changes
-from processing.reduction.measurement_matrix import field_of, measurement_matrix
 from processing.reduction.mueller import BLOCK_PIXELS
-from processing.reduction.noise import NoiseModel
-from processing.reduction.sample_states import sample_states
-from processing.reduction.solvers.field import FieldSolver
-from processing.reduction.solvers.inversion import Inversion
-from processing.reduction.solvers.plain import MuellerSolver
-from processing.reduction.solvers.weighted import WeightedSolver
+from processing.reduction.mueller_reduction import Choice, MuellerReduction
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import CaptureHeader, Detector, Sample
 from simulators.blind.undeclared_captures import TrueBench, TrueScene, digitize, expose, state_angles, write_capture
@@ -86,36 +78,26 @@ def write_frames(
     return created - begin, time.perf_counter() - created
 
 
-class OpenCapture:
+def open_capture(path: Path, choice: Choice, field_retardance: bool = False) -> tuple[Capture, MuellerReduction]:
     """What `process reduce` holds while it works on a capture, for tasks that measure its solvers alone."""
-
-    def __init__(self, path: Path, field_retardance: bool = False) -> None:
-        self.capture = Capture(path)
-        model = InstrumentModel.load(INSTRUMENT).at(662)
-        if field_retardance:
-            effects = []
-            for element, terms in FIELD_DEG.items():
-                values = {k: EffectParameter(value=v, unit="degree") for k, v in terms.items()}
-                effects.append(
-                    AppliedEffect(kind="field_retardance", element=element, parameters=values, scope="instrument")
-                )
-            model = model.model_copy(update={"effects": tuple(effects)})
-        states = sample_states(self.capture)
-        changes = capture_changes(self.capture, model, states)
-        self.w = measurement_matrix(self.capture, model, states, changes).reshape(-1, 16)
-        self.field = field_of(self.capture, model, states, changes)
-        reader = BlockReader(self.capture, states, CountCorrection.of(self.capture))
-        noise = NoiseModel.of(self.capture.header.detector, integer=True)
-        self.solver = MuellerSolver(Inversion.of(self.w), reader, noise)
+    capture, model = Capture(path), InstrumentModel.load(INSTRUMENT).at(662)
+    if field_retardance:
+        effects = []
+        for element, terms in FIELD_DEG.items():
+            values = {k: EffectParameter(value=v, unit="degree") for k, v in terms.items()}
+            effects.append(
+                AppliedEffect(kind="field_retardance", element=element, parameters=values, scope="instrument")
+            )
+        model = model.model_copy(update={"effects": tuple(effects)})
+    return capture, MuellerReduction.of(capture, model, choice=choice)
 
 
 def varying_w(path: Path, target_ms: float) -> Task:
     """uint16 frames to M, W of each pixel; peer: the pseudo-inverse of each pixel's W, built and applied."""
-    opened = OpenCapture(path, field_retardance=True)
-    if opened.field is None:
+    capture, reduction = open_capture(path, Choice(), field_retardance=True)
+    if (field := reduction.field) is None:
         raise SystemExit("the instrument has no retardance map")
-    field, (height, width) = opened.field, opened.capture.frame_shape
-    solver = FieldSolver(opened.solver, field)
+    solver, (height, width) = reduction.solver(capture), capture.frame_shape
     frames = np.array(solver.reader.read(slice(0, height))[:, 0])
     out, few = np.empty((16, height * width), np.float32), 400
 
@@ -138,10 +120,10 @@ def varying_w(path: Path, target_ms: float) -> Task:
 
 def weighted(path: Path, target_ms: float) -> Task:
     """Weighted fit with the 16 x 16 covariance of each pixel; peer: the same in numpy, batched."""
-    opened = OpenCapture(path)
-    solver, (height, width), few = WeightedSolver(opened.solver, covariance=True), opened.capture.frame_shape, 4000
+    capture, reduction = open_capture(path, Choice(weighted=True, covariance=True))
+    solver, (height, width), few = reduction.solver(capture), capture.frame_shape, 4000
     rows = max(1, BLOCK_PIXELS // width)
-    w, counts = opened.w, np.random.default_rng(2).uniform(500, 3000, (few, 40))
+    w, counts = reduction.w.reshape(-1, 16), np.random.default_rng(2).uniform(500, 3000, (few, 40))
 
     def ours() -> None:
         for first in range(0, height, rows):

@@ -20,7 +20,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import error_bar_tasks as error_bars
 import image_tasks as image
 import reduction_tasks as reduction
-import reflectance_tasks as reflectance
 from measuring import LARGE, SMALL, Task, measure
 from peer_process import PeerProcess, peer_python
 from rich.console import Console
@@ -52,9 +51,9 @@ def tasks(peers: PeerProcess | None, folder: Path) -> list[tuple[str, Callable[[
         ("error bars, quantities", error_bars.all_quantities),
         ("error bars, table", lambda: error_bars.table(folder)),
         ("mosaic", lambda: image.mosaic(LARGE, 12, peers)),
-        ("xi0", lambda: reflectance.xi0(10)),
-        ("table", lambda: reflectance.table(60)),
-        ("normals", lambda: reflectance.normals(500, folder)),
+        ("xi0", lambda: image.xi0(10)),
+        ("table", lambda: image.table(60)),
+        ("normals", lambda: image.normals(500, folder)),
         ("capture to disc", lambda: reduction.capture_to_disc(folder)),
         ("acquire", lambda: reduction.acquire(folder)),
         ("reduce", lambda: reduction.reduce_file(folder, 2500)),

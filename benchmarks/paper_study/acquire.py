@@ -116,5 +116,4 @@ def _load(path: Path) -> Any:
 
 
 def _dump(path: Path, tree: Mapping[str, Any]) -> None:
-    with path.open("w", encoding="utf-8") as file:
-        YAML(typ="safe").dump(dict(tree), file)
+    YAML(typ="safe").dump(dict(tree), path)

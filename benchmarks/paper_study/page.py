@@ -1,6 +1,7 @@
 """The study as one page: the paper's numbers next to ours, figure by figure."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -8,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from paper_study import figures
 from paper_study.acquire import FAULT, SHOWN_DEG, Size
-from paper_study.budget import QUANTITIES, budget, signed_root
 from paper_study.figures import Shown
 from paper_study.process import BODY, SPHERE, TABLE_I, TRUE_MATERIAL, BodyProducts, FaultStudy, SphereStudy
 
@@ -24,6 +24,43 @@ LABELS = {"psi_deg": "psi / degrees", "magnitude_percent": "|D| / %", "xi0_perce
 PAPER_DEVIATION = {451: 0.09, 662: 0.03}
 
 Table = tuple[str, Sequence[Sequence[str]]]
+QUANTITIES = tuple(figures.NOISE)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Mean squares over the arm angles of one figure of merit at one wavelength; a negative one made it better.
+
+    Contributions add as squares where they are independent. The noise is what the error bars of the captures predict;
+    each other one is by how much the square of the deviation falls when its cause is taken away. `remainder` is the
+    share with the true sphere and material and without noise: for xi0, the scene is not triply degenerate.
+    """
+
+    total: float
+    noise: float
+    registration: float
+    material: float
+    remainder: float
+
+
+def budget(study: SphereStudy, nm: float, quantity: str) -> Budget:
+    """The budget of a figure of merit of `processing.campaign.run.Row`."""
+    runs = (study.as_told, study.registered, study.true_material)
+    total, registered, true_material = (_mean_square(run, nm, quantity) for run in runs)
+    noises = [_mean_square(run, nm, figures.NOISE[quantity]) for run in runs]
+    # The noise differs a little between the runs: other pixels count.
+    nominal, aligned, ideal = (a - b for a, b in zip((total, registered, true_material), noises, strict=True))
+    return Budget(total, noises[0], nominal - aligned, aligned - ideal, ideal)
+
+
+def signed_root(square: float) -> float:
+    """Root of a mean square; minus that of its size where it is negative."""
+    return float(np.sign(square) * np.sqrt(abs(square)))
+
+
+def _mean_square(result: CampaignResult, nm: float, name: str) -> float:
+    values = [getattr(row, name) for row in result.rows if row.wavelength_nm == nm]
+    return float(np.nanmean(np.square(values)))
 
 
 def write_page(
@@ -44,13 +81,9 @@ def write_page(
         _numbers(size, sphere, wavelengths, seconds),
         _section("Scattering angles over sphere and body", [figures.scattering_angles(size.pixels)]),
         _section("The two terms of the model", [figures.model_terms(wavelengths[-1], size.pixels)]),
-        _section(
-            "Dominant process of the sphere, measured and modelled",
-            [figures.dominant_images("sphere", dominant)],
-        ),
-        _section(
-            "Dominant process of the body, measured and modelled",
-            [figures.dominant_images("body", of_body)],
+        *(
+            _section(f"Dominant process of the {name}, measured and modelled", [figures.dominant_images(name, images)])
+            for name, images in (("sphere", dominant), ("body", of_body))
         ),
         _section(
             f"psi and |D| at Omega {SHOWN_DEG:g} degrees",

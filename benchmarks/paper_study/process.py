@@ -139,7 +139,8 @@ def _diagnosed(captures: Path, out: Path) -> tuple[Diagnosis, Path]:
 def _xi0(faulty: CampaignResult, healthy: SphereStudy) -> dict[tuple[float, float], float]:
     """RMSD of xi0, %, of the faulty Mueller polarimeter against the sound Stokes camera, by wavelength and Omega."""
     stokes = healthy.as_told.tables
-    shape = _shape(healthy.folder)
+    with Product(next(healthy.folder.glob("*.stokes.h5"))) as product:
+        shape = product.shape
     rmsd = {}
     for row in faulty.rows:
         tables = [
@@ -150,11 +151,6 @@ def _xi0(faulty: CampaignResult, healthy: SphereStudy) -> dict[tuple[float, floa
         comparison = compare_on_sphere(tables[0], tables[1], view, row.omega_deg, shape=shape)
         rmsd[row.wavelength_nm, row.omega_deg] = comparison.get("xi0_percent", float("nan"))
     return rmsd
-
-
-def _shape(folder: Path) -> tuple[int, int]:
-    with Product(next(folder.glob("*.stokes.h5"))) as product:
-        return product.shape
 
 
 def _fits(captures: Path, products: Path, geometries: Mapping[str, Path]) -> dict[float, dict[str, FittedMaterial]]:
