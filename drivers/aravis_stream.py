@@ -6,6 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import UnknownPixelFormat
+from drivers.pixel_formats import PixelFormat
+
 # A frame with gaps is given up after this long; resend requests have had their chance by then.
 _FRAME_RETENTION_US = 200_000
 _PACKET_TIMEOUT_US = 20_000
@@ -129,3 +132,35 @@ def let_go(references: list[Any]) -> None:
     if stream is not None:
         stream.close()
     references.clear()
+
+
+def other_layout(arrival: Arrival, fmt: PixelFormat, size: tuple[int, int]) -> str | None:
+    """How the format and the size that came with a frame differ from those set; None if they do not."""
+    code, width, height = arrival.image_layout()
+    if (code, width, height) == (fmt.code, *size):
+        return None
+    return (
+        f"frame {arrival.frame_id} says code 0x{code:08x}, {width} x {height} pixels,"
+        f" but 0x{fmt.code or 0:08x}, {size[0]} x {size[1]} was set"
+    )
+
+
+def counts_of(
+    arrival: Arrival, fmt: PixelFormat, size: tuple[int, int], bits: int, *, shift: int, camera: str
+) -> NDArray[np.uint16]:
+    """Counts (rows, columns) of a whole frame, right-aligned, in memory of their own, read-only.
+
+    Raises
+    ------
+    UnknownPixelFormat
+        The counts contradict `bits` and `shift` of the rig file.
+    """
+    pixels = fmt.decode(arrival.memory, *size, shift=shift)
+    if misalignment := fmt.misalignment(arrival.memory, pixels, bits, shift):
+        raise UnknownPixelFormat(
+            f"{camera}, {fmt.name} with bits {bits} and shift {shift}",
+            misalignment,
+            "Correct `bits` and `shift` in the rig file; the camera's manual says how it aligns its data",
+        )
+    pixels.flags.writeable = False
+    return pixels

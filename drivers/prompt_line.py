@@ -4,19 +4,9 @@ and then send the prompt ">", which the SC10 and the FW102C follow with a blank.
 import re
 
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout
-from drivers.serial_link import SerialLink
+from drivers.serial_link import SerialLink, framer_of
 
-PROMPT = b">"
-
-
-def prompt_framer(buffer: bytearray) -> bytes | None:
-    """Take everything up to the prompt off the buffer."""
-    end = buffer.find(PROMPT)
-    if end < 0:
-        return None
-    frame = bytes(buffer[:end])
-    del buffer[: end + len(PROMPT)]
-    return frame
+prompt_framer = framer_of(b">")
 
 
 class PromptLine:

@@ -40,6 +40,20 @@ def line_framer(buffer: bytearray) -> bytes | None:
             return line
 
 
+def framer_of(end: bytes) -> Framer:
+    """A framer that takes everything up to `end` off the buffer, and that with it."""
+
+    def take(buffer: bytearray) -> bytes | None:
+        place = buffer.find(end)
+        if place < 0:
+            return None
+        frame = bytes(buffer[:place])
+        del buffer[: place + len(end)]
+        return frame
+
+    return take
+
+
 class Transcript:
     """Writes every byte on the wire to a text file, one line for each write and read."""
 

@@ -13,7 +13,7 @@ class TextLine(ControllerLine):
     Attributes
     ----------
     controller : its name, for messages.
-    end : what ends a command.
+    end : what ends a command; a single control character has no end.
     what_to_check : for the messages.
     """
 
@@ -21,9 +21,12 @@ class TextLine(ControllerLine):
     end: ClassVar[str]
     what_to_check: ClassVar[str] = "Check power, cable and baud rate"
 
+    def _bytes(self, command: str) -> bytes:
+        return f"{command}{self.end if command >= ' ' else ''}".encode("ascii")
+
     def send(self, command: str) -> None:
         """Write a command that answers nothing of interest; takes no lock."""
-        self.link.write(f"{command}{self.end}".encode("ascii"))
+        self.link.write(self._bytes(command))
 
     def ask(self, command: str, form: re.Pattern[str]) -> str:
         """Ask a question and return the reply of the given form; once more if none came.
@@ -32,5 +35,6 @@ class TextLine(ControllerLine):
         ------
         ReplyTimeout, ReplyError
         """
-        request, question = f"{self.controller} {self.link.port}, {command}", f"{command}{self.end}".encode("ascii")
-        return ask(self.link, question, text_of(form), self.reply_s, request=request, what_to_check=self.what_to_check)
+        request = f"{self.controller} {self.link.port}, {command if command >= ' ' else repr(command)}"
+        question, check = self._bytes(command), self.what_to_check
+        return ask(self.link, question, text_of(form), self.reply_s, request=request, what_to_check=check)

@@ -9,6 +9,7 @@ through a pipe to a process of its own, which may hang.
 """
 
 import contextlib
+import datetime
 import json
 import os
 import select
@@ -24,9 +25,9 @@ from typing import Any
 
 from acquisition.rig import alarms
 from acquisition.rig.config import RigConfig
-from acquisition.rig.journal import Journal
 from acquisition.rig.stop_axes import stop_axes
 from drivers.errors import DeviceError
+from drivers.log_process import LogProcess
 from drivers.registry import open_source
 from drivers.serial_link import LineRegistry
 from drivers.serial_ports import HELD
@@ -54,6 +55,23 @@ LONGEST_S = 86_400.0
 MOST_PORTS = 64
 #: Report of axes that obey.
 AT_REST = "axes at rest"
+
+
+class Journal:
+    """The journal of the guard: lines of JSON that another process appends to its file, if it has one."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._log = LogProcess(path)
+        self.flush = self._log.flush
+
+    def note(self, event: str, **details: Any) -> None:
+        """Add a line; a log that cannot be written holds up nothing."""
+        when = datetime.datetime.now().astimezone().isoformat(timespec="milliseconds")
+        self._log.add(json.dumps({"time": when, "event": event} | details) + "\n")
+
+    def close(self) -> None:
+        """Write the pending notes, as far as the disc takes them."""
+        self._log.close()
 
 
 class Guard:

@@ -14,9 +14,9 @@ from pydantic import Field
 from drivers.axis_types import stage_limit
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, WrongDevice
-from drivers.serial_link import ControllerLine, LineRegistry, Transcript, agreed, line_framer
+from drivers.serial_link import LineRegistry, Transcript, agreed, line_framer
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
-from drivers.unmarked_replies import ask, text_of
+from drivers.text_line import TextLine
 
 ERRORS = {6: "no such command", 7: "parameter out of range", 9: "axis out of range", 37: "axis number missing"}
 AXIS_ERRORS = {
@@ -55,8 +55,10 @@ class Config(SessionReferenceConfig):
         return f"axis {self.axis}"
 
 
-class ESP301Line(ControllerLine):
+class ESP301Line(TextLine):
     """The port of one controller, shared by its axes."""
+
+    controller, end, what_to_check = "ESP301", "\r", "Check power, cable, baud rate and RTS/CTS"
 
     def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
         super().__init__(
@@ -64,22 +66,6 @@ class ESP301Line(ControllerLine):
         )
         # The controller has one error memory for all axes, and reading takes out: each axis's own are kept here.
         self._errors: dict[int, list[int]] = {}
-
-    def send(self, command: str) -> None:
-        """Write a command that answers nothing; takes no lock."""
-        self.link.write(f"{command}\r".encode("ascii"))
-
-    def ask(self, command: str, form: re.Pattern[str]) -> str:
-        """Ask a question and return the reply of the given form; once more if none came.
-
-        Raises
-        ------
-        ReplyTimeout, ReplyError
-        """
-        label, hint = f"ESP301 {self.link.port}, {command}", "Check power, cable, baud rate and RTS/CTS"
-        return ask(
-            self.link, f"{command}\r".encode("ascii"), text_of(form), self.reply_s, request=label, what_to_check=hint
-        )
 
     def take_errors(self, axis: int) -> list[int]:
         """Empty the controller's error memory and return what concerns an axis, oldest first.

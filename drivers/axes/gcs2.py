@@ -16,8 +16,8 @@ from drivers.axis_types import stage_limit
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
 from drivers.motion import AxisConfig, MotionAxis
-from drivers.serial_link import ControllerLine, LineRegistry, Transcript, agreed, line_framer
-from drivers.unmarked_replies import ask, text_of
+from drivers.serial_link import LineRegistry, Transcript, agreed, line_framer
+from drivers.text_line import TextLine
 
 ERRORS = {
     1: "parameter syntax error",
@@ -47,37 +47,13 @@ class Config(AxisConfig):
         return f"axis {self.axis}"
 
 
-class GCS2Line(ControllerLine):
+class GCS2Line(TextLine):
     """The port of one controller, shared by its axes."""
+
+    controller, end = "GCS2", "\n"
 
     def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
         super().__init__(config, clock, transcript, line_framer, baudrate=config.baudrate, reply_s=1.0)
-
-    def send(self, command: str) -> None:
-        """Write a command that answers nothing; takes no lock."""
-        self.link.write(_bytes(command))
-
-    def ask(self, command: str, form: re.Pattern[str]) -> str:
-        """Ask a question and return the answer of the given form; once more if none came.
-
-        Raises
-        ------
-        ReplyTimeout, ReplyError
-        """
-        request = f"GCS2 {self.link.port}, {command!r}"
-        return ask(
-            self.link,
-            _bytes(command),
-            text_of(form),
-            self.reply_s,
-            request=request,
-            what_to_check="Check power, cable and baud rate",
-        )
-
-
-def _bytes(command: str) -> bytes:
-    # Single control bytes have no line end.
-    return f"{command}\n".encode("ascii") if command >= " " else command.encode("ascii")
 
 
 def read_identity(text: str) -> tuple[str, str, str, str]:

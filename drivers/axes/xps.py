@@ -20,10 +20,11 @@ from drivers.axis_types import stage_limit
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, LimitError, NotHomedError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisConfig, MotionAxis
-from drivers.serial_link import ControllerLine, LineRegistry, SerialLink, Transcript, agreed
+from drivers.serial_link import ControllerLine, LineRegistry, SerialLink, Transcript, agreed, framer_of
 from drivers.unmarked_replies import ask, text_of
 
 END = b",EndOfAPI"
+framer = framer_of(END)
 READY = range(10, 19)
 DISABLED = range(20, 39)
 NOT_REFERENCED = 42
@@ -51,16 +52,6 @@ class Config(AxisConfig):
 
     def place(self) -> str:
         return f"positioner {self.group}.{self.positioner}"
-
-
-def framer(buffer: bytearray) -> bytes | None:
-    """Take one answer off the buffer, without its end."""
-    end = buffer.find(END)
-    if end < 0:
-        return None
-    frame = bytes(buffer[:end])
-    del buffer[: end + len(END)]
-    return frame
 
 
 class XPSLine(ControllerLine):

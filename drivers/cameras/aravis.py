@@ -13,11 +13,10 @@ from typing import Any, NoReturn
 
 from drivers import genicam
 from drivers.aravis_chunks import ChunkStamps
-from drivers.aravis_frames import counts_of, other_layout
 from drivers.aravis_identity import identify
 from drivers.aravis_library import load_aravis, open_camera
 from drivers.aravis_setup import Config, Setup, structure_of
-from drivers.aravis_stream import Arrival, FrameStream, let_go
+from drivers.aravis_stream import Arrival, FrameStream, counts_of, let_go, other_layout
 from drivers.camera import Camera, CameraIdentity, CameraSettings, StreamStatistics
 from drivers.camera_clock import CameraClock
 from drivers.clock import REAL, Clock

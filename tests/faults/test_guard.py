@@ -12,8 +12,7 @@ import pytest
 from acquisition.errors import AcquisitionError
 from acquisition.rig import alarms
 from acquisition.rig.config import load_rig
-from acquisition.rig.guard import Guard, with_held_ports
-from acquisition.rig.journal import Journal
+from acquisition.rig.guard import Guard, Journal, with_held_ports
 from acquisition.rig.open_rig import open_rig
 from processing.storage.captures.capture import Capture
 from processing.yaml_file import dump_yaml
