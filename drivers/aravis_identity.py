@@ -3,7 +3,8 @@
 from typing import Any
 
 from drivers import genicam
-from drivers.aravis_setup import Config, Setup
+from drivers.aravis_config import Config
+from drivers.aravis_setup import Setup
 from drivers.camera import CameraIdentity
 from drivers.genicam import Features
 from drivers.pixel_formats import ANGLES_LAYOUT, PixelFormat

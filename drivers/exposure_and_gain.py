@@ -102,7 +102,7 @@ class ExposureAndGain:
         return (self._features.number((name,)) or 0.0) * self._unit_s(name)
 
     def _unit_s(self, name: str) -> float:
-        return genicam.seconds_of(self._features.unit(name))
+        return genicam.SECONDS.get(self._features.unit(name).strip().lower(), 1e-6)
 
     def _lower_rate(self, exposure_s: float) -> None:
         features = self._features

@@ -24,25 +24,12 @@ PACKET_DELAY = ("GevSCPD",)
 SERIAL_NUMBER = ("DeviceSerialNumber", "DeviceID")
 FIRMWARE = ("DeviceFirmwareVersion", "DeviceVersion")
 
-_SECONDS = {
-    "ns": 1e-9,
-    "us": 1e-6,
-    "µs": 1e-6,
-    "μs": 1e-6,
-    "usec": 1e-6,
-    "ms": 1e-3,
-    "msec": 1e-3,
-    "s": 1.0,
-    "sec": 1.0,
-}
+#: Seconds of units of time; microseconds, which the SFNC has, where the unit is none of them.
+SECONDS = dict.fromkeys(("us", "µs", "μs", "usec"), 1e-6) | dict.fromkeys(("ms", "msec"), 1e-3)
+SECONDS |= {"ns": 1e-9, "s": 1.0, "sec": 1.0}
 _DECIBEL, _FACTOR = ("db", "decibel", "decibels"), ("x", "factor", "times", "ratio", "fold", "multiplier")
 
 T = TypeVar("T")
-
-
-def seconds_of(unit: str) -> float:
-    """Seconds of a feature's unit of time; microseconds, which the SFNC has, where it is not known here."""
-    return _SECONDS.get(unit.strip().lower(), 1e-6)
 
 
 def gain_unit(unit: str) -> Literal["dB", "factor"] | None:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from processing.labelled import open_campaign as open_campaign
     from processing.labelled import open_dataset as open_dataset
     from processing.labelled import reduce_to_dataset as reduce_to_dataset
-    from processing.labelled import write_dataset as write_dataset
+    from processing.labelled_file import write_dataset as write_dataset
     from processing.polarization.cloude import cloude as cloude
     from processing.polarization.cloude import xi0_and_dominant as xi0_and_dominant
     from processing.polarization.decompositions.lu_chipman import lu_chipman as lu_chipman
@@ -53,7 +53,7 @@ _PUBLIC = {
     "open_campaign": "processing.labelled",
     "open_dataset": "processing.labelled",
     "reduce_to_dataset": "processing.labelled",
-    "write_dataset": "processing.labelled",
+    "write_dataset": "processing.labelled_file",
     "InstrumentModel": "processing.instrument.model",
     "StateTable": "processing.instrument.states",
     "rotating_retarders": "processing.instrument.states",

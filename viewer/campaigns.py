@@ -10,7 +10,7 @@ from typing import Any
 
 from acquisition.campaign.identity import read_identity
 from acquisition.campaign.log import LOG, read_index
-from acquisition.capture.writer import PARTIAL
+from acquisition.capture.partial_file import PARTIAL
 from processing.doors import MOST_JSON_BYTES, read_text
 from viewer.library import SATURATED, Entry, Library, NotHere
 

@@ -8,7 +8,7 @@ from typing import Any
 from starlette.requests import Request
 from starlette.responses import JSONResponse, StreamingResponse
 
-from acquisition.capture.writer import PARTIAL
+from acquisition.capture.partial_file import PARTIAL
 from acquisition.screen.run_file import running_in
 from processing.errors import ProcessError
 from processing.storage.captures.capture import Capture

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from acquisition.campaign.identity import IDENTITY
-from acquisition.capture.writer import PARTIAL
+from acquisition.capture.partial_file import PARTIAL
 from processing.errors import ProcessError
 from processing.reflectance.tables import ScatteringTable, is_table, table_steps
 from processing.storage.captures.capture import Capture

@@ -16,8 +16,8 @@ from acquisition.capture.checks import refuse_failed
 from acquisition.capture.free_name import free_name
 from acquisition.capture.header import default_name
 from acquisition.capture.job import Job, Result, check_with_devices, job_of, prepare
+from acquisition.capture.partial_file import PARTIAL
 from acquisition.capture.plan import MeasurementPlan
-from acquisition.capture.writer import PARTIAL
 from acquisition.errors import AcquisitionError
 from acquisition.rig.rig import Rig
 from acquisition.stop_request import StopRequest

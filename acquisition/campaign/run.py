@@ -20,8 +20,8 @@ from acquisition.capture.job import Job, Result, check_disc, check_with_devices,
 from acquisition.capture.job import prepare as prepare_job
 from acquisition.capture.machine_checks import check_machine
 from acquisition.capture.operator import Operator
+from acquisition.capture.partial_file import PARTIAL, bytes_needed, seal_whole
 from acquisition.capture.plan import MeasurementPlan
-from acquisition.capture.writer import PARTIAL, bytes_needed, seal_whole
 from acquisition.disc import on_disc
 from acquisition.errors import Differs, InterlockOpened, PlanRefused, Stopped, Unforeseen, as_run_error
 from acquisition.rig.config import RigConfig

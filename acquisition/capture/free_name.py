@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from acquisition.capture.partial_file import NEW, PARTIAL
 from acquisition.capture.synced import make_folder
-from acquisition.capture.writer import NEW, PARTIAL
 from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError
 

@@ -19,8 +19,8 @@ from acquisition.capture.checks import (
 )
 from acquisition.capture.identity import require_same
 from acquisition.capture.mosaic_phase import match_mosaic
+from acquisition.capture.partial_file import bytes_needed, check_space
 from acquisition.capture.plan import AutoExposure, MeasurementPlan
-from acquisition.capture.writer import bytes_needed, check_space
 from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig

@@ -8,6 +8,7 @@ import logging
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -66,7 +67,7 @@ class CaptureRunner:
     table : rows of the capture.
     writer : open partial file.
     detector : for the black level and full scale of the statistics.
-    observers : receive every event; the simulated bench is one of them.
+    observers : receive every event.
     saturation_limit : fraction of saturated pixels from which a state raises TooBright; None never.
     mosaic : True for a polarization sensor.
     lit_darks : comparison of darks and lights that has seen the states of earlier runs; None for a new one.
@@ -90,8 +91,7 @@ class CaptureRunner:
         turns: Mapping[str, int] | None = None,
         rows: Array | None = None,
     ) -> None:
-        self.rig = rig
-        self.table = table
+        self.rig, self.table = rig, table
         self.writer = writer
         self.detector = detector
         self.stop = stop
@@ -176,16 +176,8 @@ class CaptureRunner:
             while losses != self.rig.light_losses():
                 # Frames exposed while the light was shut from outside do not count.
                 losses = self.rig.light_losses()
-                found_s = find_exposure(
-                    self.rig,
-                    self.table,
-                    self.poses_deg,
-                    instrument,
-                    sample=sample,
-                    auto=auto,
-                    observers=self.observers,
-                    warn=self.warn,
-                )
+                probe = partial(find_exposure, self.rig, self.table, self.poses_deg, instrument)
+                found_s = probe(sample=sample, auto=auto, observers=self.observers, warn=self.warn)
         self._light = None
         self._scale_exposure(found_s / auto.start_s)
 

@@ -13,10 +13,11 @@ from acquisition.capture.header import capture_header, now, title_of
 from acquisition.capture.identity import devices_of, require_same_devices
 from acquisition.capture.job import Job, Result, frame_shape
 from acquisition.capture.mosaic_phase import match_mosaic
+from acquisition.capture.partial_file import as_partial
 from acquisition.capture.plan import ARM, AutoExposure
 from acquisition.capture.records import begin_record, end_record
 from acquisition.capture.runner import CaptureRunner, TooBright
-from acquisition.capture.writer import CaptureWriter, as_partial
+from acquisition.capture.writer import CaptureWriter
 from acquisition.cleanup import run_all
 from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError, Stopped, as_run_error

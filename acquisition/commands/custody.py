@@ -5,7 +5,7 @@ from pathlib import Path
 
 from acquisition.campaign.log import INDEX, PLAN, CampaignFolder, entry_of, read_index
 from acquisition.campaign.plan import Campaign, CampaignCapture, captures
-from acquisition.capture.writer import NEW, PARTIAL, mark_not_taken, seal_whole
+from acquisition.capture.partial_file import NEW, PARTIAL, mark_not_taken, seal_whole
 from acquisition.commands.doctor import Finding
 from acquisition.errors import AcquisitionError
 from processing.errors import ProcessError

@@ -21,10 +21,10 @@ from acquisition.capture.identity import rig_content
 from acquisition.capture.job import Job, Result, check_with_devices, job_of, prepare, stored_plan, stored_rig
 from acquisition.capture.machine_checks import check_machine
 from acquisition.capture.operator import Operator
+from acquisition.capture.partial_file import PARTIAL, seal_whole
 from acquisition.capture.plan import MeasurementPlan
 from acquisition.capture.state_file import wait_until_free
 from acquisition.capture.synced import make_folder
-from acquisition.capture.writer import PARTIAL, seal_whole
 from acquisition.commands.defaults import CONFIGS, DEFAULT_RIG, INTERRUPTED
 from acquisition.disc import disc_process, on_disc
 from acquisition.errors import AcquisitionError

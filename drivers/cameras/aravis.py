@@ -13,9 +13,10 @@ from typing import Any, NoReturn
 
 from drivers import genicam
 from drivers.aravis_chunks import ChunkStamps
+from drivers.aravis_config import Config, structure_of
 from drivers.aravis_identity import identify
 from drivers.aravis_library import load_aravis, open_camera
-from drivers.aravis_setup import Config, Setup, structure_of
+from drivers.aravis_setup import Setup
 from drivers.aravis_stream import Arrival, FrameStream, counts_of, let_go, other_layout
 from drivers.camera import Camera, CameraIdentity, CameraSettings, StreamStatistics
 from drivers.camera_clock import CameraClock

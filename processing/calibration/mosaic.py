@@ -20,7 +20,8 @@ from processing.reduction.sample_states import sample_states
 from processing.reduction.solvers.inversion import multiply_tiles
 from processing.storage.captures.capture import Capture
 from processing.storage.products.pixel_mask import Mask
-from processing.storage.products.product import Plane, ProductWriter, Step
+from processing.storage.products.product import Plane, Step
+from processing.storage.products.product_writer import ProductWriter
 
 LINEAR = 3
 

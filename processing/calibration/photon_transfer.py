@@ -17,7 +17,8 @@ from processing.reduction.black import Black
 from processing.reduction.noise import QUANTIZATION, NoiseModel
 from processing.storage.captures.capture import Capture
 from processing.storage.products.pixel_mask import Mask
-from processing.storage.products.product import Plane, Product, ProductWriter, Step
+from processing.storage.products.product import Plane, Product, Step
+from processing.storage.products.product_writer import ProductWriter
 
 #: Levels between black and the brightest pixel at which the variance is taken.
 LEVELS = 48

@@ -16,7 +16,8 @@ from processing.maps.xi0 import dominant_model, estimate_from_stokes, refit
 from processing.polarization import triply_degenerate
 from processing.reduction.systematic import INPUTS, Systematic
 from processing.storage.products.images import StokesImage
-from processing.storage.products.product import Plane, Product, ProductWriter, Step
+from processing.storage.products.product import Plane, Product, Step
+from processing.storage.products.product_writer import ProductWriter
 
 #: Kind of the product.
 EXTRAPOLATED = "extrapolated"

@@ -17,7 +17,8 @@ from processing.maps.intervals import set_ellipticity, set_magnitudes, set_ratio
 from processing.polarization import gradients
 from processing.polarization.quantities import POLARIZATIONS, NamedStokes
 from processing.storage.products.images import MuellerImage
-from processing.storage.products.product import ProductWriter, is_lit
+from processing.storage.products.product import is_lit
+from processing.storage.products.product_writer import ProductWriter
 
 Pairs = Mapping[str, tuple[NamedStokes, NamedStokes]]
 

@@ -43,7 +43,8 @@ from processing.polarization.vector_noise import VectorNoise, of_slopes
 from processing.reduction.mueller import Progress
 from processing.reduction.systematic import INPUTS, Systematic
 from processing.storage.products.images import MuellerImage, require_all_elements, seen_elements
-from processing.storage.products.product import LIT_ERRORS, Plane, Product, ProductError, ProductWriter, Step, is_lit
+from processing.storage.products.product import LIT_ERRORS, Plane, Product, ProductError, Step, is_lit
+from processing.storage.products.product_writer import ProductWriter
 
 #: Pixels of a block: gradients take 128 bytes a pixel and quantity.
 BLOCK_PIXELS = 1 << 14

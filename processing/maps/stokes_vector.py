@@ -19,7 +19,8 @@ from processing.maps.partial_quantities import determined_maps, partial_block, p
 from processing.reduction.sent_light import sent_parts, sent_rows
 from processing.reduction.systematic import Systematic
 from processing.storage.products.images import SMALLEST, MuellerImage, seen_elements
-from processing.storage.products.product import COMPANIONS, LIT_ERRORS, Plane, Product, ProductWriter
+from processing.storage.products.product import COMPANIONS, LIT_ERRORS, Plane, Product
+from processing.storage.products.product_writer import ProductWriter
 
 _AXIS = "from +x of the analyzer frame"
 #: By the name that the same quantity of a matrix has: the name here, and what it is.

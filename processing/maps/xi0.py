@@ -26,7 +26,8 @@ from processing.reflectance.base import load_reflectance
 from processing.storage.captures.schema import CaptureHeader
 from processing.storage.products.images import MuellerImage, StokesImage, require_all_elements
 from processing.storage.products.pixel_mask import Mask
-from processing.storage.products.product import Plane, Product, ProductWriter, Step
+from processing.storage.products.product import Plane, Product, Step
+from processing.storage.products.product_writer import ProductWriter
 
 #: Limits of the validity mask (docs/quantities.md, "xi0 and its interval"): on the noise, not on the outcome.
 MAX_CONDITION = 100.0

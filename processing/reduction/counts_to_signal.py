@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from processing.instrument.changes import places
 from processing.reduction.black import Black
+from processing.reduction.capture_evidence import evidence_of
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.flat import FlatField
-from processing.reduction.frame_evidence import evidence_of
 from processing.reduction.lit_darks import leaked_light, resume_lit_darks
 from processing.storage.captures.capture import Capture, CaptureError
 from processing.storage.products.pixel_mask import Mask

@@ -11,7 +11,8 @@ from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.inversion import Inversion
 from processing.storage.captures.capture import CaptureError
 from processing.storage.products.pixel_mask import Mask
-from processing.storage.products.product import ProductWriter, is_lit
+from processing.storage.products.product import is_lit
+from processing.storage.products.product_writer import ProductWriter
 
 #: Above this median, the model and not the noise makes the residual (the median of a good one is within 0.1 of 1).
 SUSPICIOUS_CHI_SQUARE = 1.5

@@ -21,7 +21,8 @@ from processing.reduction.mueller_reduction import Choice, MuellerReduction
 from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.base import Solver
 from processing.storage.captures.capture import Capture, CaptureError
-from processing.storage.products.product import ProductWriter, Step
+from processing.storage.products.product import Step
+from processing.storage.products.product_writer import ProductWriter
 
 #: Called with (rows done, rows in all).
 Progress = Callable[[int, int], None]

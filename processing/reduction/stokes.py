@@ -29,7 +29,8 @@ from processing.reduction.sample_states import sample_states
 from processing.reduction.systematic import Systematic
 from processing.storage.captures.capture import Capture, CaptureError
 from processing.storage.products.pixel_mask import Mask
-from processing.storage.products.product import Plane, ProductWriter, Step, is_lit
+from processing.storage.products.product import Plane, Step, is_lit
+from processing.storage.products.product_writer import ProductWriter
 
 #: The method that docs/mosaic.md found best.
 DEFAULT_METHOD = "oriented"

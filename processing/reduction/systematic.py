@@ -16,7 +16,8 @@ from processing.instrument.model import InstrumentModel
 from processing.instrument.uncertainty import value_directions
 from processing.reduction.effects_of_capture import FEATURES, CountsCorrection
 from processing.storage.products.images import SMALLEST
-from processing.storage.products.product import Product, ProductWriter
+from processing.storage.products.product import Product
+from processing.storage.products.product_writer import ProductWriter
 
 #: Fact of a product: what its directions are.
 INPUTS = "uncertain_in_the_instrument"

@@ -13,6 +13,7 @@ from simulators.camera.event_messages import (
     RETRIES,
     TIMEOUT_MS,
 )
+from simulators.camera.genicam.node_tree import REGISTERS, NodeError, NodeTree
 from simulators.camera.genicam.register import RegisterMemory
 
 # Version 1.2; big-endian registers and UTF-8 texts; writing memory, several registers at once, packets again, events.
@@ -26,6 +27,7 @@ _TEXTS = {
 }
 _XML_URL, _URL_BYTES = 0x0200, 512
 _TICKS_PER_S = 1_000_000_000
+MOST_XML_BYTES = 1 << 24
 
 
 def boot(memory: RegisterMemory, address: str, texts: dict[str, str], xml: tuple[str, int, int]) -> None:
@@ -71,3 +73,16 @@ def boot(memory: RegisterMemory, address: str, texts: dict[str, str], xml: tuple
         memory.write(register, texts[name].encode()[: length - 1].ljust(length, b"\0"))
     name, place, length = xml
     memory.write(_XML_URL, f"Local:{name};{place:X};{length:X}".encode().ljust(_URL_BYTES, b"\0"))
+
+
+def free_address(nodes: NodeTree) -> int:
+    """An address for the XML at which no register lies."""
+    registers = []
+    for name in nodes:
+        if nodes.node(name).tag in REGISTERS:
+            try:
+                registers.append(nodes.register(name))
+            except NodeError:
+                continue
+    tops = range(0xFF00_0000, 0, -MOST_XML_BYTES)
+    return next(top for top in tops if not any(register.overlaps(top, MOST_XML_BYTES) for register in registers))

@@ -81,3 +81,12 @@ def send(
         for number, packet in enumerate(frame.packets(max(register(PACKET_SIZE) & 0xFFFF, _LEAST_PACKET_BYTES))):
             if (numbers is None or number in numbers) and random.random() >= lost_ratio:
                 channel.sendmsg(packet, (), 0, receiver)
+
+
+def send_test_packet(register: Callable[[int], int], address: str) -> None:
+    """Send one packet of the size that the controlling host wants, with which it sees whether that gets through."""
+    host = socket.inet_ntoa(struct.pack(">I", register(HOST_ADDRESS)))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as channel:
+        channel.bind((address, 0))
+        size = max(0, (register(PACKET_SIZE) & 0xFFFF) - TRANSPORT_BYTES)
+        channel.sendto(bytes(size), (host, register(HOST_PORT) & 0xFFFF))

@@ -8,7 +8,6 @@ One camera occupies one address. A second one at the same time needs a second lo
 with `ip addr add 127.0.0.2/8 dev lo`.
 """
 
-import socket
 import struct
 import threading
 import time
@@ -18,22 +17,14 @@ from typing import Self
 
 from drivers.errors import CameraError
 from drivers.pixel_formats import pixel_format_of
-from simulators.camera.bootstrap import boot
+from simulators.camera.bootstrap import MOST_XML_BYTES, boot, free_address
 from simulators.camera.control_channel import ControlChannel
 from simulators.camera.event_messages import EventMessages, Moment
 from simulators.camera.exposure import PixelSource, counts_of
-from simulators.camera.frame_packets import (
-    HOST_ADDRESS,
-    HOST_PORT,
-    PACKET_SIZE,
-    TRANSPORT_BYTES,
-    FramePackets,
-    send,
-    with_chunks,
-)
+from simulators.camera.frame_packets import PACKET_SIZE, FramePackets, send, send_test_packet, with_chunks
 from simulators.camera.genicam.features import LOADS, START, STOP, TRIGGER, FeatureValues
 from simulators.camera.genicam.formula import Number
-from simulators.camera.genicam.node_tree import REGISTERS, NodeError, NodeTree
+from simulators.camera.genicam.node_tree import NodeError, NodeTree
 from simulators.camera.genicam.power_up import power_up
 from simulators.camera.genicam.register import RegisterMemory
 from simulators.camera.gige_features import describe
@@ -42,7 +33,6 @@ from simulators.camera.loopback_address import LoopbackAddress
 
 # Set by a program that wants one packet of the size to see whether it gets through.
 _TEST_PACKET = 1 << 31
-_MOST_XML_BYTES = 1 << 24
 _KEPT_FRAMES = 4
 # Between two frames of a camera that runs without triggers.
 _FREE_RUN_S = 0.05
@@ -158,19 +148,8 @@ class GigeCamera:
             self._default = self._memory.copy()
         except RecursionError as error:
             raise NodeError(f"{description.source}: its features refer to each other without an end") from error
-        self._xml_at = self._free_address()
+        self._xml_at = free_address(self._nodes)
         self._texts = texts
-
-    def _free_address(self) -> int:
-        registers = []
-        for name in self._nodes:
-            if self._nodes.node(name).tag in REGISTERS:
-                try:
-                    registers.append(self._nodes.register(name))
-                except NodeError:
-                    continue
-        tops = range(0xFF00_0000, 0, -_MOST_XML_BYTES)
-        return next(top for top in tops if not any(register.overlaps(top, _MOST_XML_BYTES) for register in registers))
 
     # --- life --------------------------------------------------------------------------------------------
 
@@ -264,7 +243,7 @@ class GigeCamera:
     def read(self, address: int, count: int) -> bytes:
         """Bytes of the registers, or of the description behind them."""
         start = address - self._xml_at
-        if 0 <= start < _MOST_XML_BYTES:
+        if 0 <= start < MOST_XML_BYTES:
             return self._description.served[start : start + count].ljust(count, b"\0")
         with self._lock:
             return self._memory.read(address, count)
@@ -274,7 +253,8 @@ class GigeCamera:
         with self._wake:
             self._memory.write(address, data)
             if address == PACKET_SIZE and self._bootstrap(PACKET_SIZE) & _TEST_PACKET:
-                self._send_test_packet()
+                self._memory.write(PACKET_SIZE, struct.pack(">I", self._bootstrap(PACKET_SIZE) & ~_TEST_PACKET))
+                send_test_packet(self._bootstrap, self.address)
             try:
                 commands = self._features.heard(address, len(data))
                 self._features.follow()
@@ -311,16 +291,6 @@ class GigeCamera:
 
     def _bootstrap(self, address: int) -> int:
         return int(struct.unpack(">I", self._memory.read(address, 4))[0])
-
-    def _send_test_packet(self) -> None:
-        size = self._bootstrap(PACKET_SIZE)
-        self._memory.write(PACKET_SIZE, struct.pack(">I", size & ~_TEST_PACKET))
-        host = socket.inet_ntoa(self._memory.read(HOST_ADDRESS, 4))
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as channel:
-            channel.bind((self.address, 0))
-            channel.sendto(
-                bytes(max(0, (size & 0xFFFF) - TRANSPORT_BYTES)), (host, self._bootstrap(HOST_PORT) & 0xFFFF)
-            )
 
     # --- exposures ---------------------------------------------------------------------------------------
 

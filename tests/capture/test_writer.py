@@ -16,18 +16,9 @@ import pytest
 
 from acquisition.capture import layout
 from acquisition.capture import writer as writer_module
+from acquisition.capture.partial_file import as_partial, bytes_needed, check_space, mark_not_taken, seal_whole
 from acquisition.capture.state_file import StateFile
-from acquisition.capture.writer import (
-    DEAD_S,
-    LOOK_S,
-    CaptureWriter,
-    StateRecord,
-    as_partial,
-    bytes_needed,
-    check_space,
-    mark_not_taken,
-    seal_whole,
-)
+from acquisition.capture.writer import DEAD_S, LOOK_S, CaptureWriter, StateRecord
 from acquisition.disc import disc, on_disc
 from acquisition.errors import AcquisitionError
 from acquisition.stop_request import StopRequest

@@ -10,7 +10,8 @@ import pytest
 
 from acquisition.commands.doctor import describe_axis
 from drivers.errors import CommandRejected, DeviceError, LimitError, MotionFailed, ReplyTimeout
-from processing.labelled import open_dataset, write_dataset
+from processing.labelled import open_dataset
+from processing.labelled_file import write_dataset
 from simulators.clock import FastClock
 from simulators.conformance.axis_faults import AxisFaults
 from simulators.conformance.axis_lines import SerialPortConformance

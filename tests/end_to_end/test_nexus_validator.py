@@ -18,7 +18,7 @@ from processing.steps.reduction import Reduction
 from processing.storage.captures.packed_capture import pack_capture
 from processing.storage.captures.schema import CaptureHeader, write_closing
 from processing.storage.integrity.checksums import row_crc32, write_checksums
-from processing.storage.products.product import ProductWriter
+from processing.storage.products.product_writer import ProductWriter
 
 STATES, SHAPE = 24, (6, 8)
 

@@ -21,7 +21,8 @@ from processing.steps.reduction import Reduction
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import CaptureHeader
 from processing.storage.products.images import MuellerImage
-from processing.storage.products.product import Plane, Product, ProductWriter
+from processing.storage.products.product import Plane, Product
+from processing.storage.products.product_writer import ProductWriter
 
 DOCS = Path(__file__).parents[2] / "docs"
 STATES, SHAPE = 24, (6, 8)

@@ -5,7 +5,8 @@ import pytest
 
 from processing.reports import colours, figures
 from processing.storage.captures.schema import CaptureHeader
-from processing.storage.products.product import Plane, Product, ProductWriter
+from processing.storage.products.product import Plane, Product
+from processing.storage.products.product_writer import ProductWriter
 
 
 def disc(shape=(80, 80), radius=30):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from acquisition.capture.writer import check_space
+from acquisition.capture.partial_file import check_space
 from acquisition.errors import AcquisitionError
 from processing import doors
 from processing.commands.application import main as process
@@ -18,7 +18,8 @@ from processing.storage.captures.schema import CaptureHeader, Detector
 from processing.storage.formats.foreign_arrays import ImportFailed
 from processing.storage.formats.import_request import ImportRequest
 from processing.storage.formats.importing import import_capture
-from processing.storage.products.product import Plane, ProductError, ProductWriter
+from processing.storage.products.product import Plane, ProductError
+from processing.storage.products.product_writer import ProductWriter
 
 TWICE = {
     "calibrate": (process, ["--instrument", "i.yaml", "--free", "x"]),

@@ -10,8 +10,8 @@ from acquisition.campaign.run import check_all
 from acquisition.capture import session
 from acquisition.capture.checks import refuse_failed
 from acquisition.capture.job import check_with_devices, job_of, prepare
+from acquisition.capture.partial_file import mark_not_taken
 from acquisition.capture.plan import MeasurementPlan
-from acquisition.capture.writer import mark_not_taken
 from acquisition.errors import AcquisitionError, PlanRefused
 from acquisition.rig.config import load_rig
 from acquisition.rig.forbidden_poses import find_forbidden

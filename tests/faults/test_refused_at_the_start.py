@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from acquisition.capture.writer import bytes_needed
+from acquisition.capture.partial_file import bytes_needed
 from drivers.errors import DeviceError
 from processing.storage.captures.capture import Capture
 from simulators.rig.served_rig import serve

@@ -12,7 +12,8 @@ import pytest
 from processing.commands.application import main
 from processing.errors import ProcessError
 from processing.storage.captures.schema import CaptureHeader, Detector
-from processing.storage.products.product import Plane, ProductWriter
+from processing.storage.products.product import Plane
+from processing.storage.products.product_writer import ProductWriter
 from processing.whole_file import whole_file, write_new_text, write_whole_text
 
 SHAPE = (20, 30)

@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import pytest
 
-from acquisition.capture import writer
+from acquisition.capture import partial_file, writer
 from acquisition.capture.runner import CaptureRunner
 from acquisition.capture.state_file import StateFile
 from acquisition.errors import AcquisitionError
@@ -204,14 +204,14 @@ def test_a_folder_deleted_in_mid_run_is_noticed_with_the_next_state(run_with, tm
 
 def test_a_layout_that_a_disc_has_lost_is_no_capture(run_with, monkeypatch, tmp_path):
     """Zeros where the targets should be: an arm that was sent to 35 would be recorded as sent to 0."""
-    put = writer.put_layout
+    put = partial_file.put_layout
 
     def lose(path, *arguments):
         put(path, *arguments)
         with h5py.File(path, "r+") as h5:
             h5["entry/instrument/arm/target_value"][...] = 0
 
-    monkeypatch.setattr(writer, "put_layout", lose)
+    monkeypatch.setattr(partial_file, "put_layout", lose)
     moved = []
     with pytest.raises(StopIteration):
         run_with(lambda *_: moved.append(1), plan=SHORT)

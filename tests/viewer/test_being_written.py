@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from acquisition.capture.layout import put_layout
+from acquisition.capture.partial_file import finish
 from acquisition.capture.state_file import StateFile
-from acquisition.capture.writer import finish
 from acquisition.errors import AcquisitionError
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import CaptureHeader, create_layout

@@ -11,7 +11,8 @@ from processing.reports.colours import colours_of, scale_of
 from processing.steps.maps import Quantities
 from processing.steps.reduction import Reduction
 from processing.storage.captures.schema import CaptureHeader, Detector
-from processing.storage.products.product import Plane, Product, ProductWriter
+from processing.storage.products.product import Plane, Product
+from processing.storage.products.product_writer import ProductWriter
 
 
 def plane(answer):

@@ -26,8 +26,8 @@ from processing.diagnosis.search.rules import (
 )
 from processing.instrument.changes import Conditions, elapsed, elapsed_error
 from processing.instrument.model import InstrumentModel
+from processing.reduction.capture_evidence import evidence_of
 from processing.reduction.counts_to_signal import CountCorrection
-from processing.reduction.frame_evidence import evidence_of
 from processing.reduction.measurement_matrix import angles_of, relative_exposure
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states

@@ -11,7 +11,8 @@ from processing.storage.captures.schema import CaptureHeader
 from processing.storage.formats.axostep import AxoStepError, MuellerFile, read_mueller_file, write_mueller_file
 from processing.storage.products.images import MUELLER_PLANES, require_all_elements
 from processing.storage.products.pixel_mask import Mask
-from processing.storage.products.product import Product, ProductWriter, Step, file_identity
+from processing.storage.products.product import Product, Step, file_identity
+from processing.storage.products.product_writer import ProductWriter
 from processing.storage.products.provenance import made_of
 
 

@@ -1,6 +1,5 @@
 """Read states.csv: one row per state, with errors that name line and column."""
 
-import csv
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -10,9 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.doors import one_line, read_text_of_any_system
+from processing.doors import one_line
 from processing.storage.captures.schema import NOT_AXES
 from processing.storage.formats.foreign_arrays import ImportFailed, is_array, read_column
+from processing.storage.formats.text_table import Row, read_table
 
 ROLES = ("sample", "air", "dark", "flat")
 CHANNEL_PREFIX = "channel_"
@@ -24,19 +24,9 @@ MILLI = {"time_ms": "time_s", "exposure_ms": "exposure_s"}
 IN_ORDER = "rows"
 #: What a column must look like, as a name in the capture file.
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_ .-]{0,63}")
-#: What may stand between columns; a spreadsheet takes semicolons where the comma is in the numbers.
-DELIMITERS = ",;\t"
 _THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3})+(\.\d*)?")
 #: Largest angle in degrees; controllers count no further.
 MOST_DEG = 1e6
-MOST_COLUMNS = 200
-#: Lines of words before the header of a table, at most.
-MOST_LINES_BEFORE = 60
-MOST_STATES = 100_000
-
-
-#: Line number and cells.
-Row = tuple[int, list[str]]
 
 
 @dataclass(frozen=True)
@@ -127,7 +117,7 @@ def read_states(
     mapping = {_axis_name(name): text for name, text in (columns or {}).items()}
     vectors = {name: read_column(text) for name, text in mapping.items() if is_array(text)} | dict(arrays or {})
     if path is not None:
-        header, rows, units, delimiter = _table(
+        header, rows, units, delimiter = read_table(
             path, [text for name, text in mapping.items() if name not in vectors and text != IN_ORDER]
         )
     else:
@@ -252,76 +242,6 @@ def _with_arrays(
         header = [*header, name if _is_known(name, name, ()) else f"{name}_deg"]
         rows = [(line, [*row, repr(float(v))]) for (line, row), v in zip(rows, values, strict=True)]
     return header, rows
-
-
-def _table(path: Path, required: Sequence[str]) -> tuple[list[str], list[Row], dict[str, str], str]:
-    """Header, rows with their line numbers, units that stand in a line of their own, and the delimiter."""
-    text_lines = read_text_of_any_system(path, ImportFailed).splitlines(keepends=True)
-    first = next((k for k, line in enumerate(text_lines) if line.strip() and not line.startswith("#")), 0)
-    if first and _is_all_numbers(text_lines[first]):
-        # As numpy writes a table: its names are a comment.
-        first -= 1
-        text_lines[first] = text_lines[first].lstrip("# ")
-    header, rows, delimiter = _parse_rows(path, text_lines, first)
-    if any(len(row) != len(header) for _, row in rows) or not set(required) <= set(header):
-        # A log may begin with lines on the measurement: the header is the first that fits all rows after it.
-        for start in range(first + 1, min(first + MOST_LINES_BEFORE, len(text_lines))):
-            table = _parse_rows(path, text_lines, start)
-            fits = table[1] and all(len(row) == len(table[0]) for _, row in table[1]) and set(required) <= set(table[0])
-            if fits and not any(map(_is_number, table[0])) and (required or len(table[0]) > 1):
-                header, rows, delimiter = table
-                break
-    if header and all(_is_number(h) for h in header):
-        raise ImportFailed(
-            f"{path}: has no line with the names of its columns. Without --states, name each column by its number, as "
-            f"--columns 'psg={path}[0]'"
-        )
-    if not header or not rows:
-        raise ImportFailed(f"{path}: needs a header line and one row per state; found {len(rows)} rows")
-    if len(header) > MOST_COLUMNS or len(rows) > MOST_STATES:
-        raise ImportFailed(
-            f"{path}: {len(header)} columns and {len(rows)} rows; at most {MOST_COLUMNS} and {MOST_STATES} are read"
-        )
-    for line, row in rows:
-        if len(row) != len(header):
-            raise ImportFailed(f"{path}:{line}: {len(row)} columns, the header has {len(header)}")
-    units: dict[str, str] = {}
-    if len(rows) > 1 and not any(map(_is_number, rows[0][1])) and any(map(_is_number, rows[1][1])):
-        units, rows = dict(zip(header, rows[0][1], strict=True)), rows[1:]
-    # Spreadsheets write delimiters behind the last column.
-    used = [k for k, h in enumerate(header) if h or any(row[k] for _, row in rows)]
-    return [header[k] for k in used], [(line, [row[k] for k in used]) for line, row in rows], units, delimiter
-
-
-def _parse_rows(path: Path, text_lines: list[str], first: int) -> tuple[list[str], list[Row], str]:
-    """Header and rows from one line on."""
-    title = text_lines[first] if text_lines else ""
-    delimiter = max(DELIMITERS, key=title.count)
-    if delimiter not in title and len(text_lines) > first + 1 and len(text_lines[first + 1].split()) > 1:
-        delimiter = " "
-        text_lines = [" ".join(line.split()) + "\n" for line in text_lines]
-    try:
-        reader = csv.reader(text_lines[first:], delimiter=delimiter)
-        header = [h.strip() for h in next(reader, [])]
-        cells = ((first + reader.line_num, [c.strip() for c in row]) for row in reader)
-        # A logger may write a delimiter behind the last column of the rows alone.
-        rows = [(n, row if any(row[len(header) :]) else row[: len(header)]) for n, row in cells if any(row)]
-    except csv.Error as error:
-        raise ImportFailed(f"{path}: is not a CSV text file ({error})") from error
-    return header, rows, delimiter
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text.replace(",", "."))
-    except ValueError:
-        return False
-    return True
-
-
-def _is_all_numbers(line: str) -> bool:
-    parts = re.split(r"[;\t ]+|,\s*", line.strip())
-    return all(_is_number(part) for part in parts if part)
 
 
 def _require_columns(path: Path, header: list[str], names: list[str], axes: Sequence[str]) -> None:
