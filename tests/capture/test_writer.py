@@ -14,8 +14,7 @@ import h5py
 import numpy as np
 import pytest
 
-from acquisition.capture import layout
-from acquisition.capture import writer as writer_module
+from acquisition.capture import layout, partial_file
 from acquisition.capture.partial_file import as_partial, bytes_needed, check_space, mark_not_taken, seal_whole
 from acquisition.capture.state_file import StateFile
 from acquisition.capture.writer import DEAD_S, LOOK_S, CaptureWriter, StateRecord
@@ -196,7 +195,7 @@ def test_nothing_is_overwritten(create, tmp_path):
 def test_room_that_is_too_small_is_refused_with_both_numbers(monkeypatch, tmp_path):
     needed = bytes_needed(3, 2, SHAPE)
     assert needed == 3 * (2 * 4 * (5 * 2 + 4) + 512) + (3 << 19)
-    monkeypatch.setattr(writer_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=needed))
+    monkeypatch.setattr(partial_file.shutil, "disk_usage", lambda _: SimpleNamespace(free=needed))
     check_space(tmp_path, needed)
     with pytest.raises(AcquisitionError, match=rf"needs {needed + 1:,} bytes in .*, {needed:,} are free"):
         check_space(tmp_path, needed + 1)
