@@ -17,13 +17,15 @@ LEAST = 0.55
 _STEPS, _CLOSE = 6, 3e-3
 #: A variance that changes by less than this part is taken as it is.
 _ALIKE = 0.08
+#: Pixels that a loop takes at a time, so that its numbers stay in the cache.
+_RUN = 512
 
 _FAST: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
 
 
 @in_parts
 def _elements_at_once(m: Array, numbers: NDArray[np.int64], covariance: Array, out: Array, part: slice) -> None:
-    m, covariance = m[part].astype(float), covariance[part].astype(float)
+    m, covariance = m[:, part].T.astype(float), np.moveaxis(covariance[..., part], -1, 0).astype(float)
     v = m[:, numbers] / m[:, :1]
     by = covariance[:, 0, numbers] - v * covariance[:, 0, :1] / 2
     c = covariance[:, numbers[:, None], numbers] - v[:, None] * by[..., None] - v[..., None] * by[:, None]
@@ -32,8 +34,8 @@ def _elements_at_once(m: Array, numbers: NDArray[np.int64], covariance: Array, o
 
 @in_parts
 def _slopes_at_once(vector: Array, by_element: Array, covariance: Array, out: Array, part: slice) -> None:
-    by = np.moveaxis(by_element[:, part].astype(float), 0, 1)
-    _moments_at_once(by @ covariance[part] @ np.swapaxes(by, 1, 2), vector[:, part].T.astype(float), out[:, part])
+    by, covariance = (np.moveaxis(each[..., part].astype(float), -1, 0) for each in (by_element, covariance))
+    _moments_at_once(by @ covariance @ np.swapaxes(by, 1, 2), vector[:, part].T.astype(float), out[:, part])
 
 
 def _moments_at_once(c: Array, v: Array, out: Array) -> None:
@@ -87,76 +89,123 @@ def _farthest_at_once(length: Array, first: Array, second: Array, one: Array, ot
 
 @compiled(_elements_at_once, **_FAST)
 def elements(m, numbers, covariance, out, start, stop):  # type: ignore[no-untyped-def]
+    """`VectorNoise` (11, pixels) of elements over m00, of m (16, pixels) with covariance (16, 16, pixels)."""
     n = len(numbers)
-    c, v, by = np.empty((n, n), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
-    for p in range(start, stop):
-        scale = np.float32(1) / m[p, 0]
+    c, v, by = np.empty((n, n, _RUN), np.float32), np.empty((n, _RUN), np.float32), np.empty((n, _RUN), np.float32)
+    scale, sums = np.empty(_RUN, np.float32), np.empty((4, _RUN), np.float32)
+    for first in range(start, stop, _RUN):
+        count = min(_RUN, stop - first)
+        for p in range(count):
+            scale[p] = 1 / m[0, first + p]
         for i in range(n):
-            v[i] = m[p, numbers[i]] * scale
-            # Of m_i - v_i m00 / 2: with it the noise of m00 is two products.
-            by[i] = covariance[p, 0, numbers[i]] - np.float32(0.5) * v[i] * covariance[p, 0, 0]
-        scale *= scale
+            a = numbers[i]
+            for p in range(count):
+                v[i, p] = m[a, first + p] * scale[p]
+                # Of m_i - v_i m00 / 2: with it the noise of m00 is two products.
+                by[i, p] = covariance[0, a, first + p] - np.float32(0.5) * v[i, p] * covariance[0, 0, first + p]
+        for p in range(count):
+            scale[p] *= scale[p]
         for i in range(n):
             for j in range(i + 1):
-                c[i, j] = (covariance[p, numbers[i], numbers[j]] - v[j] * by[i] - v[i] * by[j]) * scale
-        _moments(c, v, out, p)
+                a, b = numbers[i], numbers[j]
+                for p in range(count):
+                    c[i, j, p] = (covariance[a, b, first + p] - v[j, p] * by[i, p] - v[i, p] * by[j, p]) * scale[p]
+        _moments(c, v, by, sums, out, first, count)
 
 
 @compiled(_slopes_at_once, **_FAST)
 def slopes(vector, by_element, covariance, out, start, stop):  # type: ignore[no-untyped-def]
+    """The same of a vector (n, pixels) with its gradient (n, 16, pixels)."""
     n = len(by_element)
-    c, by = np.empty((n, n), np.float32), np.empty(16, np.float32)
-    for p in range(start, stop):
+    c, v, by = np.empty((n, n, _RUN), np.float32), np.empty((n, _RUN), np.float32), np.empty((n, _RUN), np.float32)
+    moved, sums = np.empty(_RUN, np.float32), np.empty((4, _RUN), np.float32)
+    for first in range(start, stop, _RUN):
+        count = min(_RUN, stop - first)
         for i in range(n):
-            for k in range(16):
-                by[k] = 0
-                for a in range(16):
-                    by[k] += covariance[p, k, a] * by_element[i, p, a]
+            v[i, :count] = vector[i, first : first + count]
             for j in range(i + 1):
                 c[i, j] = 0
-                for k in range(16):
-                    c[i, j] += by[k] * by_element[j, p, k]
-        _moments(c, vector[:, p], out, p)
+            for k in range(16):
+                moved[:] = 0
+                for a in range(16):
+                    _add_product(
+                        moved, covariance[k, a, first : first + count], by_element[i, a, first : first + count]
+                    )
+                for j in range(i + 1):
+                    _add_product(c[i, j], moved, by_element[j, k, first : first + count])
+        _moments(c, v, by, sums, out, first, count)
 
 
 @compiled(**_FAST)
-def _moments(c, v, out, p):  # type: ignore[no-untyped-def]
-    """`vector_noise.VectorNoise` of a vector v and its covariance, the lower half of which is filled."""
-    n = len(c)
-    by = np.empty(n, np.float32)
-    total, square, along, size = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-    for i in range(n):
-        by[i] = c[i, i] * v[i]
-        total += c[i, i]
-        size += v[i] * v[i]
-        square += c[i, i] * c[i, i] / 2
+def _add_product(total, a, b):  # type: ignore[no-untyped-def]
+    for p in range(len(b)):
+        total[p] += a[p] * b[p]
+
+
+@compiled(**_FAST)
+def _add_row(row, v, by, i, total, square):  # type: ignore[no-untyped-def]
+    """Add up C v, tr C and tr C^2: a row i of the lower half of C."""
+    for p in range(len(total)):
+        by[i, p] = row[i, p] * v[i, p]
+        total[p] += row[i, p]
+        square[p] += row[i, p] * row[i, p]
+    for j in range(i):
+        for p in range(len(total)):
+            square[p] += 2 * row[j, p] * row[j, p]
+            by[i, p] += row[j, p] * v[j, p]
+            by[j, p] += row[j, p] * v[i, p]
+
+
+@compiled(**_FAST)
+def _across(c, by, p):  # type: ignore[no-untyped-def]
+    total = np.float32(0)
+    for i in range(len(c)):
+        total += c[i, i, p] * by[i, p] * by[i, p]
         for j in range(i):
-            square += c[i, j] * c[i, j]
-            by[i] += c[i, j] * v[j]
-            by[j] += c[i, j] * v[i]
-    square *= 2
+            total += 2 * by[i, p] * c[i, j, p] * by[j, p]
+    return total
+
+
+@compiled(**_FAST)
+def _moments(c, v, by, sums, out, first, count):  # type: ignore[no-untyped-def]
+    """`vector_noise.VectorNoise` of vectors v (n, pixels) and their covariance, the lower half of which is filled.
+
+    Parameters
+    ----------
+    by, sums : (n, pixels) and (4, pixels), filled.
+    """
+    n = len(c)
+    sums[:] = 0
+    total, square, size, turned = sums
+    along = out[0, first : first + count]
+    along[:] = 0
     for i in range(n):
-        along += by[i] * v[i]
-    along /= size
-    out[0, p], out[1, p], out[2, p] = along, total, square
-    turned, across = np.float32(0), np.float32(0)
+        _add_row(c[i], v, by, i, total, square)
     for i in range(n):
-        by[i] -= along * v[i]
-        turned += by[i] * by[i]
-    mixed = np.sqrt(turned / size)
-    # By how much noise along v turns it, and, where that matters, the noise along the direction to which it does.
-    turn = DEVIATES[1] * mixed / np.sqrt(along * size)
-    if turn * (2 * mixed + turn * total) >= _ALIKE * along:
-        for i in range(n):
-            across += c[i, i] * by[i] * by[i]
-            for j in range(i):
-                across += 2 * by[i] * c[i, j] * by[j]
-        across /= turned
-    _reach(np.sqrt(size), along, mixed, across, out[3:5, p])
+        _add_product(along, by[i], v[i, :count])
+        _add_product(size, v[i], v[i])
+    for p in range(count):
+        along[p] /= size[p]
+        out[1, first + p], out[2, first + p] = total[p], square[p]
+    for i in range(n):
+        for p in range(count):
+            by[i, p] -= along[p] * v[i, p]
+        _add_product(turned, by[i], by[i])
+    for p in range(count):
+        mixed, length = np.sqrt(turned[p] / size[p]), np.sqrt(size[p])
+        # By how much noise along v turns it, and, where that matters, the noise along the direction to which it does.
+        turn = DEVIATES[1] * mixed / (np.sqrt(along[p]) * length)
+        across = np.float32(0)
+        if turn * (2 * mixed + turn * total[p]) >= _ALIKE * along[p]:
+            across = _across(c, by, p) / turned[p]
+        _reach(length, along[p], mixed, across, out[3:5, first + p])
     place = 5
     for apart in range(3):
         for i in range(3 - apart):
-            out[place, p] = c[i + apart, i] if i + apart < n else np.nan
+            packed = out[place, first : first + count]
+            packed[:] = np.nan
+            if i + apart < n:
+                packed[:] = c[i + apart, i, :count]
             place += 1
 
 

@@ -33,7 +33,7 @@ class VectorNoise(NamedTuple):
 
 def of_elements(covariance: NDArray[np.floating], m: Array, elements: Sequence[int]) -> VectorNoise:
     """Of elements over m00, from the covariance (..., 16, 16) of matrices (..., 4, 4)."""
-    flat = np.ascontiguousarray(m, dtype=np.float32).reshape(-1, 16)
+    flat = np.ascontiguousarray(m.reshape(-1, 16).T, dtype=np.float32)
     numbers = np.asarray(elements)
     return _each(covariance, m.shape[:-2], lambda *rest: kernels.elements(flat, numbers, *rest))
 
@@ -41,14 +41,14 @@ def of_elements(covariance: NDArray[np.floating], m: Array, elements: Sequence[i
 def of_slopes(covariance: NDArray[np.floating], vector: RealArray, slopes: RealArray) -> VectorNoise:
     """Of vectors (n, ...) with these gradients (n, ..., 16), likewise."""
     values = np.ascontiguousarray(vector.reshape(len(vector), -1), dtype=np.float32)
-    by = np.ascontiguousarray(slopes.reshape(len(vector), -1, 16), dtype=np.float32)
+    by = np.ascontiguousarray(np.swapaxes(slopes.reshape(len(vector), -1, 16), 1, 2), dtype=np.float32)
     return _each(covariance, vector.shape[1:], lambda *rest: kernels.slopes(values, by, *rest))
 
 
 def _each(covariance: NDArray[np.floating], shape: tuple[int, ...], loop: Callable[..., object]) -> VectorNoise:
-    each = np.ascontiguousarray(covariance, dtype=np.float32).reshape(-1, 16, 16)
-    out = np.empty((11, len(each)), np.float32)
-    for_ranges(len(each), lambda start, stop: loop(each, out, start, stop))
+    each = np.ascontiguousarray(np.moveaxis(covariance.reshape(-1, 16, 16), 0, -1), dtype=np.float32)
+    out = np.empty((11, each.shape[-1]), np.float32)
+    for_ranges(each.shape[-1], lambda start, stop: loop(each, out, start, stop))
     found = out.reshape(-1, *shape).astype(float)
     along, total, square, below, above = found[:5]
     return VectorNoise(along, total, square, below, above, found[5:])

@@ -190,21 +190,22 @@ class MuellerImage:
 
     @cached_property
     def _covariance(self) -> NDArray[np.floating]:
+        # Loops over pixels run along the memory.
         full: NDArray[np.floating]
         if self.facts["weighted"]:
             normal = np.einsum("np,ni,nj->pij", 1 / self.intensity_variance, self.w, self.w, optimize=True)
             is_complete = int(self.facts.get("rank", 16)) == 16
-            full = np.linalg.inv(normal) if is_complete else np.linalg.pinv(normal, rcond=SMALLEST**2, hermitian=True)
-            full = full + self.dark @ self.dark.T
+            each = np.linalg.inv(normal) if is_complete else np.linalg.pinv(normal, rcond=SMALLEST**2, hermitian=True)
+            full = np.moveaxis(each + self.dark @ self.dark.T, 0, -1)
         else:
             drive, variance = self._sources
-            full = (variance.T @ (drive[:, None] * drive).reshape(256, -1).T).reshape(-1, 16, 16)
+            full = ((drive[:, None] * drive).reshape(256, -1) @ variance).reshape(16, 16, -1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            scale = self.errors.reshape(16, -1).T / np.sqrt(np.einsum("pii->pi", full))
-        scale[:, ~self.is_determined] = 0.0
-        full *= scale[:, :, None]
-        full *= scale[:, None, :]
-        return full.reshape(*self.mask.shape, 16, 16)
+            scale = self.errors.reshape(16, -1) / np.sqrt(np.einsum("iip->ip", full))
+        scale[~self.is_determined] = 0.0
+        full *= scale
+        full *= scale[:, None]
+        return np.moveaxis(full, -1, 0).reshape(*self.mask.shape, 16, 16)
 
     def covariance_of_depolarizer(self) -> NDArray[np.float64]:
         """Covariance (16, 16) of the elements of an ideal depolarizer, in any unit: the same for every pixel.
