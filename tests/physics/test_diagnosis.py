@@ -66,6 +66,20 @@ def test_a_retardance_error_is_invisible_with_an_unknown_sample_and_plain_with_a
     assert found.stderr < 0.05
 
 
+@pytest.mark.parametrize(
+    ("kind", "bench"),
+    [
+        ("psg_azimuth", TrueBench(og=TrueBench().og + np.deg2rad(4))),
+        ("psg_retardance", TrueBench(dg=TrueBench().dg + np.deg2rad(12))),
+    ],
+)
+def test_a_large_fault_is_named_alone(configs, tmp_path, kind, bench):
+    """An effect with more values fits as well, but it is no alternative: its other values are not needed."""
+    (effect,) = diagnosed(capture(tmp_path, configs, bench, air=True), configs).effects
+    assert (effect.kind, effect.answer, effect.confident) == (kind, "sure", True)
+    assert not effect.indistinguishable_from
+
+
 @pytest.mark.long
 def test_azimuths_of_analyzer_and_its_retarder_are_named_together(configs, tmp_path):
     """With an unknown sample the two cannot be told apart, and air is what separates them."""

@@ -19,6 +19,9 @@ from processing.diagnosis.search.rules import ALIKE, LIKELY, NOMINAL_TAU, OUTSTA
 from processing.diagnosis.search.sets import probability_at
 from processing.diagnosis.search.space import Problem
 
+#: [log odds] By which one of two causes has to be likelier for a sure name.
+LEAST_DIFFERENCE = float(np.log(SURE / (1 - SURE)))
+
 Answer = Literal["sure", "likely", "one of", "unlisted", "unknown"]
 
 
@@ -67,9 +70,10 @@ def causes(posterior: Posterior, chi2: float) -> tuple[Cause, ...]:
     result = []
     for k in posterior.free_groups:
         # Odds of every group as the replacement of this one, its own included.
-        odds = posterior.sets.conditional(posterior.sets.without(state, k)).log_odds
-        least = least_odds(odds[k], chi2 / state.unit)
-        rivals = posterior.sets.free & (state.tau == 0) & (odds > least)
+        given_others = posterior.sets.conditional(posterior.sets.without(state, k))
+        odds = given_others.log_odds
+        forgiven = forgiven_misfit(given_others.fit_gain, k, chi2 / state.unit)
+        rivals = posterior.sets.free & (state.tau == 0) & (odds > max(odds[k] - LEAST_DIFFERENCE, 0.0) - forgiven)
         alternatives = [int(j) for j in np.argsort(-odds) if rivals[j]]
         alternatives += [j for j in posterior.rivals.get(k, ()) if j not in alternatives]
         parts = [posterior.space.slices[m] for m in posterior.members[k]]
@@ -96,12 +100,14 @@ def significance(values: Array, covariance: Array) -> float:
     return float(values @ np.linalg.lstsq(covariance, values)[0]) / max(SHOWN**2, n + SHOWN * float(np.sqrt(2 * n)))
 
 
-def least_odds(odds: float, chi2: float) -> float:
-    """Log odds above which an alternative group is named together with a cause.
+def forgiven_misfit(fit_gain: Array, k: int, chi2: float) -> Array:
+    """Part of its misfit that is no evidence against each group (G,) as the replacement of group k, in log odds.
 
-    `chi2` is that which no cause explains, in its unit.
+    A model that is not exact fits a little worse than it should. That does not excuse a model with more values: its
+    prior counts in full. `chi2` is that which no cause explains, in its unit.
     """
-    return max(odds - max(float(np.log(SURE / (1 - SURE))), ALIKE * odds, 0.5 * chi2), 0.0)
+    allowed = max(ALIKE * fit_gain[k], 0.5 * chi2)
+    return np.asarray(np.clip(fit_gain[k] - fit_gain, 0.0, allowed))
 
 
 def _of_family(posterior: Posterior, k: int) -> list[int]:

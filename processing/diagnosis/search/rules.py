@@ -123,7 +123,7 @@ LIKELY = 0.9
 #: [log odds] By which another group, or set, may be worse and still be tried, 1 to 1100: the unit of chi-square may
 #: fall with it.
 ALTERNATIVE = 7.0
-#: [of what the cause explains] The same: no effect's model is exact.
+#: [of what the cause explains] Misfit that does not rule out another cause: no effect's model is exact.
 ALIKE = 1e-3
 #: [standard deviations] From which on a value is not zero; of several as many beyond what chance gives all of them.
 SHOWN = 3.0

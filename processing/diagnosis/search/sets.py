@@ -141,10 +141,14 @@ class SetFit:
 
 @dataclass(frozen=True)
 class Conditional(SetFit):
-    """The same, with the conditional posterior of every group: log odds (G,), and weights (G, T) of each tau."""
+    """The same, with the conditional posterior of every group: log odds (G,), and weights (G, T) of each tau.
+
+    `fit_gain` (G,): the part of the log odds that a better fit gives; the prior takes the rest.
+    """
 
     log_odds: Array
     tau_weights: Array
+    fit_gain: Array
 
 
 class Sets:
@@ -253,7 +257,7 @@ class Sets:
         With `follow` the unit is that which a group leaves, where it is not there yet.
         """
         fit, inverse, right = self._solved(state)
-        log_odds = np.full(len(self.groups), np.inf)
+        log_odds, fit_gain = np.full(len(self.groups), np.inf), np.zeros(len(self.groups))
         weights, now = np.zeros((len(self.groups), self.taus.size)), self.noise.log_likelihood(fit.excess)
         for members, s, q in self._cavities(state, fit, inverse, right):
             value, along = _along_axes(s, q)
@@ -273,10 +277,11 @@ class Sets:
             share = np.exp(gain - top)
             total = share.sum(axis=1, keepdims=True)
             weights[members[:, None], kept] = share / total
+            fit_gain[members] = 0.5 * np.sum(explained * share / total, axis=1)
             log_odds[members] = (top + np.log(total))[:, 0]
         is_included = (state.tau > 0) & self.free
         log_odds = np.where(self.free, log_odds + self.prior_odds(is_included), np.inf)
-        return Conditional(**vars(fit), log_odds=log_odds, tau_weights=weights)
+        return Conditional(**vars(fit), log_odds=log_odds, tau_weights=weights, fit_gain=fit_gain)
 
     def _cavities(
         self, state: State, fit: SetFit, inverse: Array, right: Array
