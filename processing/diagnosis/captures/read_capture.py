@@ -223,9 +223,10 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         slope, floor = slope * frames.variance_ratio / side**2, floor * frames.variance_ratio / side**2
         data = replace(data, slope=slope, floor=floor, noise_known=True, noise_source=noise.source)
     stated = capture.sigma
+    black = correction.black
     if noise is not None and stated is None:
-        of_means = correction.black.mean_variance(noise) * frames.black_variance_ratio
-        data = without_noise_of_darks(data, capture, model, states=states, black=correction.black, variance=of_means)
+        of_means = black.mean_variance(noise) * frames.black_variance_ratio
+        data = without_noise_of_darks(data, capture, model, states=states, black=black, variance=of_means)
     if stated is not None:
         floor = (stated[states] / top / side) ** 2
         data = replace(
@@ -233,6 +234,11 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         )
     if not data.noise_known and data.usable.sum() >= FEWEST_PIXELS:
         data = estimated_noise(data)
+        if black.measured:
+            of_means = np.where(np.isnan(black.scatter), data.floor.mean() * (top * side) ** 2, black.scatter)
+            of_means = of_means / black.states
+            data = without_noise_of_darks(data, capture, model, states=states, black=black, variance=of_means)
+            data = estimated_noise(data)
     return without_dark_pixels(data) if data.noise_known else data
 
 

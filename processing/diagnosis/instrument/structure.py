@@ -83,8 +83,8 @@ def compute_residual(problem: InstrumentProblem, capture: int, space: Space, fit
     rows = a.shape[0]
     height, width = data.signal.shape[2:]
     usable = data.usable
-    if data.steep is not None and not any(c.reaches_around for c in space.candidates):
-        # Where nothing is said to move, edges must fit as well: a focus that changes shows nowhere else.
+    if data.steep is not None and data.moved_px is None and not any(c.reaches_around for c in space.candidates):
+        # Where nothing was moved or is said to move, edges must fit as well: a focus that changes shows nowhere else.
         usable = usable | data.steep
     used = (usable & ~data.clipped if changes.drop_clipped else usable) & inside(height, width)
     coefficients, whitened = problem.coefficients(capture, changes), problem.columns(capture, changes)
