@@ -216,10 +216,8 @@ def _tests(
     s /= np.sqrt(np.sum(s**2, axis=1, keepdims=True, dtype=float)).astype(np.float32) + np.float32(1e-30)
     along = np.sum(flat * s, axis=1, dtype=float)
     expectation = np.sum(noise * s**2, axis=1, dtype=float)
-    tests["brightness"] = (
-        np.sum(along**2) - expectation.sum(),
-        np.sqrt(2 * np.sum(expectation**2) * spread + 1e-300),
-    )
+    # Rows of one pixel go together, since its unknowns are projected out: a sum of squares of all has this deviation.
+    tests["brightness"] = np.sum(along**2) - expectation.sum(), np.sqrt(2 * expectation.sum() * spread + 1e-300)
     # Neighbours: noise of two pixels is independent, or as alike as moving the frames has made it.
     for k, name in enumerate(("neighbours, rows", "neighbours, columns")):
         if r.shape[k + 1] > 2:
@@ -248,8 +246,7 @@ def _patches(r: NDArray[np.float32], expected: NDArray[np.float32], spread: floa
     total = np.nansum(r[:, :h, :w].reshape(shape), axis=(2, 4), dtype=np.float64)
     null = np.where(np.isfinite(r[:, :h, :w]), expected[:, :h, :w], 0).reshape(shape).sum(axis=(2, 4), dtype=np.float64)
     pixels = side**2
-    deviation = np.sqrt(2 * np.sum(null**2) * spread + 1e-300)
-    return float((np.sum(total**2) - null.sum()) / pixels), float(deviation / pixels)
+    return float((np.sum(total**2) - null.sum()) / pixels), float(np.sqrt(2 * null.sum() / pixels * spread + 1e-300))
 
 
 def correlates_of(r: NDArray[np.float32], signal: NDArray[np.float32], good: NDArray[np.bool_]) -> dict[str, float]:
