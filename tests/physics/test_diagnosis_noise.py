@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from steady_capture import steady_capture
 
+from processing.diagnosis.captures.noise import estimated_noise
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block, noise_information
 from processing.diagnosis.instrument.structure import Images, Residual, _tests, descriptions
 from processing.diagnosis.search.space import Sums
+from processing.instrument.model import InstrumentModel
 
 STATES, SIDE, SIGMA = 8, 240, 0.01
 
@@ -61,6 +63,23 @@ def test_tests_of_pure_noise_scatter_by_one_standard_deviation():
         found.append([value for name, value in tests.items() if name != "sum of squares"])
     assert len(found[0]) == 5
     assert np.std(found, axis=0) == pytest.approx(np.ones(5), abs=0.25)
+
+
+def test_noise_of_light_is_told_where_the_sample_shows_few_of_its_elements(configs):
+    """Of 16 directions over the states ten hold noise alone, most of it that of bright pixels."""
+    random, states, side, electrons = np.random.default_rng(9), 40, 44, 50_000.0
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
+    turned = 9.0 * np.arange(states)
+    rows = model.rows({"psg": turned, "psa": 4.91 * turned}).reshape(states, 16)
+    m = np.zeros((16, side, side))
+    m[0] = np.exp(random.normal(size=(side, side)) - 3)
+    m[[1, 4, 5, 10, 15]] = m[0] * random.uniform(-0.3, 0.3, (5, side, side))
+    light = np.tensordot(rows, m, 1)
+    read = 0.03 * light.mean() / electrons
+    noise = random.normal(0, np.sqrt(read), light.shape)
+    found = estimated_noise(steady_capture(random.poisson(electrons * light) / electrons + noise, 0.0))
+    assert found.slope[0] * electrons == pytest.approx(1, abs=0.02)
+    assert found.floor[0] == pytest.approx(read, rel=0.1)
 
 
 def test_what_captures_leave_over_is_told_with_their_names():

@@ -72,15 +72,41 @@ def estimated_noise(data: CaptureData) -> CaptureData:
     if picked.size > PIXELS:
         picked = picked[:: picked.size // PIXELS + 1]
     y = data.signal.reshape(data.values_per_pixel, -1)[:, picked].astype(np.float64)
-    rows = y.shape[0]
-    keep = min(COMPONENTS, rows - 1, max(picked.size // 4, 1)) if data.sample is None else min(2, rows - 1)
-    u, _, _ = np.linalg.svd(y @ y.T)
-    residual = y - u[:, :keep] @ (u[:, :keep].T @ y)
-    # A row that the components follow closely has less scatter left than its noise.
-    share = 1 - np.sum(u[:, :keep] ** 2, axis=1)
-    good = share > SMALL if rows > FEW_ROWS else share > 0.0
-    square = residual[good] ** 2 / share[good, None]
-    signal = (y - residual)[good]
+    most = COMPONENTS if data.sample is None else 2
+    none = np.ones((len(y), 1))
+    slope, floor = _line_of_scatter(y, none, none[:1], min(most, len(y) - 1, max(picked.size // 4, 1)))
+    # In units of that noise, as it is by rows and by pixels, components that are no larger than noise show; they would
+    # take away the noise of the brightest.
+    variance = slope * np.maximum(y, 0) + floor
+    of_row, of_pixel = (np.sqrt(variance.mean(axis=axis, keepdims=True)) for axis in (1, 0))
+    of_pixel /= np.sqrt(variance.mean())
+    size = np.linalg.eigvalsh(_squared(y / of_row / of_pixel)) / picked.size
+    keep = int(np.sum(size > (1 + np.sqrt(len(y) / picked.size)) ** 2))
+    slope, floor = _line_of_scatter(y, of_row, of_pixel, min(keep, most, len(y) - 1))
+    n = data.signal.shape[0]
+    return replace(
+        data,
+        slope=np.full(n, slope),
+        floor=np.full(n, floor),
+        noise_known=True,
+        noise_estimated=True,
+        noise_source="estimated from the scatter over pixels that is left after the leading components of the states",
+    )
+
+
+def _line_of_scatter(y: Array, of_row: Array, of_pixel: Array, keep: int) -> tuple[float, float]:
+    """Slope and floor of the scatter of y (L, P) that `keep` components leave of it, over (L, 1) and (1, P)."""
+    z = y / of_row / of_pixel
+    u, size, _ = np.linalg.svd(_squared(z))
+    along, u = (u[:, :keep].T @ z) ** 2 / size[:keep, None], u[:, :keep]
+    outside = of_row * (np.eye(len(y)) - u @ u.T) / of_row.T
+    residual = outside @ y
+    # What is left of one row has noise of the others. Rows and pixels that the components follow closely have less.
+    of_noise = outside**2
+    share = of_noise.sum(axis=1, keepdims=True)
+    good = (share > (SMALL if len(y) > FEW_ROWS else 0.0))[:, 0]
+    square = residual[good] ** 2 / share[good] / np.maximum(1 - along.sum(axis=0), SMALL)
+    signal = ((of_noise / share) @ np.maximum(y - residual, 0))[good]
     # Signals that rounding alone sets apart share a level, or it would hang on the processor's order of sums.
     alike = np.round(signal / max(float(np.ptp(signal)), 1e-300), DIGITS)
     edges = np.quantile(alike, np.linspace(0, 1, LEVELS + 1))
@@ -96,16 +122,11 @@ def estimated_noise(data: CaptureData) -> CaptureData:
     floor = max(floor, LEAST_FLOOR * float(np.mean(square)), 1e-12)
     # Weighted as it will be used, the scatter must come out as one.
     correction = float(np.mean(square / (slope * np.maximum(signal, 0) + floor)))
-    slope, floor = slope * correction, floor * correction
-    n = data.signal.shape[0]
-    return replace(
-        data,
-        slope=np.full(n, slope),
-        floor=np.full(n, floor),
-        noise_known=True,
-        noise_estimated=True,
-        noise_source="estimated from the scatter over pixels that is left after the leading components of the states",
-    )
+    return slope * correction, floor * correction
+
+
+def _squared(x: Array) -> Array:
+    return np.asarray(x @ x.T)
 
 
 #: [intensities] Of the image that are looked at: enough for a part in a thousand of the noise.
@@ -445,9 +466,11 @@ def noise_factors(noise: DetectorNoise, shown: float, estimated: bool) -> tuple[
     factors = np.array([noise.shot, noise.dark]) / shown
     white = noise.white / shown
     inverse = np.asarray(np.linalg.inv(noise.covariance / shown**2), dtype=float)
-    if estimated:
-        return _balance(noise, white, max(float(factors[1]), SMALL))
     usual = 1.0, 1.0
+    if estimated:
+        if _distance(factors, usual, inverse) < NOISE_SURE**2:
+            return usual
+        return _balance(noise, white, max(float(factors[1]), SMALL))
     bent = noise.bent
     least = NOISE_OFF if shown == 1 else NOISE_OFF_MIXED
     far = not min(bent, 1.0) - least < white < max(bent, 1.0) + least
