@@ -11,7 +11,9 @@ import pytest
 from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.instrument_file import extend_model
+from processing.diagnosis.search.fit import minimize, prior
 from processing.diagnosis.search.result import Check
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
@@ -121,6 +123,61 @@ def test_all_wavelengths_of_the_telescope(public_files, configs, tmp_path):
     told = held_out_of_each(public_files, configs, tmp_path, None)
     assert len(told) == 22
     assert sum(c.after <= 0.25 for c in told) >= 18
+
+
+@pytest.mark.skipif("UMOV_SLOW" not in os.environ, reason="takes three minutes: UMOV_SLOW=1")
+@pytest.mark.timeout(1800)
+def test_terms_of_even_wavelengths_predict_whole_states_of_odd_ones(public_files, configs, tmp_path):
+    """Terms and their sizes are of the even wavelengths; their values are fitted to four fifths of the odd states."""
+    instrument = configs / "instruments/dual_beam_charis.yaml"
+    model = InstrumentModel.load(instrument)
+    paths = [path for _, path in sorted(telescope(public_files, tmp_path, instrument).items())]
+    found = diagnose_captures(paths[::2], model)[0].solution
+    known: dict[tuple[str, str], list[np.ndarray]] = {}
+    for c, part in found.space.pairs:
+        known.setdefault((c.kind, c.place), []).append(
+            found.fit.values[part] if c.effect.per_state else found.weak[part] * c.typical**2
+        )
+    models, data = [], []
+    for path in paths[1::2]:
+        with Capture(path) as capture:
+            models.append(model.nominal_at(capture.header.wavelength_nm))
+            data.append(read_capture(capture, models[-1]))
+    bench = WholeBench(InstrumentProblem(models, data), print)
+    # As the moments of the captures are divided.
+    fold = np.random.default_rng(0).permutation(data[0].conditions.states) % bench.problem.folds
+
+    def left_over(with_angles: bool) -> float:
+        """Rms of (left - right) / (left + right) in states that no fit saw, percent, mean over the wavelengths."""
+        terms = [
+            c
+            for c in bench.pool
+            if (c.kind, c.place) in known and (with_angles or not c.effect.per_state) and not c.effect.is_nominal
+        ]
+        space = Space((*bench.base.candidates, *terms))
+        start, weak, free = np.zeros(space.size), prior(space), np.ones(space.size, dtype=bool)
+        for c, part in space.pairs:
+            if c in bench.base.candidates:
+                start[part] = bench.start[c]
+            elif c.effect.per_state:
+                # One exposure holds all wavelengths: the angles are those that the even ones found.
+                (start[part],), free[part] = known[c.kind, c.place], False
+            elif known[c.kind, c.place][0].size == c.size:
+                weak[part] = np.mean(known[c.kind, c.place], axis=0) / c.typical**2
+        start = minimize(bench.problem, space, start, weak=weak, free=free).values
+        error = np.zeros((len(data), fold.size))
+        for f in range(bench.problem.folds):
+            others = [g for g in range(bench.problem.folds) if g != f]
+            values = minimize(bench.problem, space, start, others, weak=weak, free=free).values
+            for k, capture in enumerate(bench.problem.captures):
+                told = (bench.problem.rows(k, space, values) @ capture.sample).reshape(-1, 2)
+                seen = capture.signal.reshape(-1, 2)
+                ratio = [(i[:, 0] - i[:, 1]) / i.sum(axis=1) for i in (seen, told)]
+                error[k, fold == f] = (ratio[0] - ratio[1])[fold == f]
+        return float(100 * np.sqrt((error**2).mean(axis=1)).mean())
+
+    assert 0.1 < left_over(with_angles=False) < 0.26
+    assert 0.1 < left_over(with_angles=True) < 0.215
 
 
 def one_detector(public_files, folder: Path, instrument: Path, wavelength_nm: int, beside: int) -> Path:
