@@ -188,9 +188,9 @@ def parse_json(text: str | bytes, source: str, error: type[ProcessError] = Proce
     return value
 
 
-def read_json(path: Path, error: type[ProcessError] = ProcessError) -> Any:
-    """Value of a JSON file. Raises `error`."""
-    return parse_json(read_text(path, error, MOST_JSON_BYTES), str(path), error)
+def read_json(path: Path) -> Any:
+    """Value of a JSON file. Raises ProcessError."""
+    return parse_json(read_text(path, ProcessError, MOST_JSON_BYTES), str(path), ProcessError)
 
 
 def is_line(text: str) -> bool:

@@ -14,7 +14,7 @@ from processing.instrument.model import InstrumentModel
 from processing.instrument.states import StateTable
 from processing.polarization import mueller
 
-#: Probes are not tries of a state: the simulated bench counts them apart.
+#: Probes are not tries of a state: observers count them apart.
 PROBE = 1000
 #: States probed for each kind of sample that nothing is known about.
 PROBES_EACH = 2

@@ -32,11 +32,9 @@ COLUMN_BYTES = 512
 ROW_SUM_BYTES = 4
 
 
-def bytes_needed(states: int, channels: int, frame_shape: tuple[int, int], itemsize: int = 2) -> int:
-    """Bytes of a capture file of this size."""
-    return (
-        states * (channels * frame_shape[0] * (frame_shape[1] * itemsize + ROW_SUM_BYTES) + COLUMN_BYTES) + LAYOUT_BYTES
-    )
+def bytes_needed(states: int, channels: int, frame_shape: tuple[int, int]) -> int:
+    """Bytes of a capture file of this size; a count has two."""
+    return states * (channels * frame_shape[0] * (2 * frame_shape[1] + ROW_SUM_BYTES) + COLUMN_BYTES) + LAYOUT_BYTES
 
 
 def check_space(folder: Path, needed: int) -> None:

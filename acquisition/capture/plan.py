@@ -210,7 +210,8 @@ class MeasurementPlan(FiniteSection):
         columns = {name: np.full(n, float(angle)) for name, angle in pose_deg.items() if name not in turning} | turning
         columns = {name: np.repeat(column, factors) for name, column in columns.items()}
         dark: Role = "dark"
-        role: tuple[Role, ...] = (dark,) * darks + (self.role or _sample_role(self.sample),) * (n * factors)
+        light: Role = self.role or ("air" if self.sample.kind == "air" else "sample")
+        role = (dark,) * darks + (light,) * (n * factors)
         exposures = exposure_s * np.tile(self.bracket, self.darks + n)
         return StateTable(
             angles_deg={k: np.concatenate([np.full(darks, column[0]), column]) for k, column in columns.items()},
@@ -218,7 +219,3 @@ class MeasurementPlan(FiniteSection):
             role=role,
             repeats=np.full(len(role), self.repeats, dtype=np.int64),
         )
-
-
-def _sample_role(sample: Sample) -> Role:
-    return "air" if sample.kind == "air" else "sample"

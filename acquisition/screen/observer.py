@@ -1,4 +1,4 @@
-"""Observers of a run: progress bar, live page, campaign log, and the simulated bench."""
+"""Observers of a run: progress bar, live page, campaign log, and those of the rig."""
 
 from dataclasses import dataclass
 from typing import Any

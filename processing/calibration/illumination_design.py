@@ -1,6 +1,5 @@
 """Which illumination a linear Stokes capture should have, by the standard error of xi0 that it predicts."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,12 +15,14 @@ from processing.reflectance.base import ReflectanceModel
 
 #: Jarecki and Kupinski's fifteen arm angles.
 PAPER_OMEGA_DEG = tuple(float(v) for v in range(20, 91, 5))
+#: Between two linear states, and rows and columns with which the object is sampled.
+STEP_DEG, PIXELS = 15.0, 100
 
 
-def linear_states(step_deg: float = 15.0) -> dict[str, Array]:
-    """Stokes vectors of unit power by name: linear at every `step_deg` (horizontal is 0, vertical 90), circular."""
+def linear_states() -> dict[str, Array]:
+    """Stokes vectors of unit power by name: linear at every `STEP_DEG` (horizontal is 0, vertical 90), circular."""
     states: dict[str, Array] = {}
-    for angle in np.arange(0.0, 180.0, step_deg):
+    for angle in np.arange(0.0, 180.0, STEP_DEG):
         name = {0.0: "horizontal", 90.0: "vertical"}.get(float(angle), f"linear {angle:g} deg")
         t = 2 * np.deg2rad(angle)
         states[name] = np.array([1.0, np.cos(t), np.sin(t), 0.0])
@@ -71,33 +72,30 @@ def predict(
     camera: InstrumentModel,
     *,
     states: dict[str, Array],
-    omega_deg: Sequence[float] = PAPER_OMEGA_DEG,
-    assumptions: Assumptions | None = None,
-    pixels: int = 100,
-    progress: Progress | None = None,
+    assumptions: Assumptions,
+    progress: Progress,
 ) -> list[Prediction]:
-    """Predicted standard errors of each illumination, best first.
+    """Predicted standard errors of each illumination at the paper's arm angles, best first.
 
     Parameters
     ----------
     camera : instrument whose analyzer channels are those of the Stokes camera; its generator is not used.
     states : Stokes vectors of unit power, by name.
-    pixels : the object is sampled with so many rows and columns.
     """
-    assumed = assumptions or Assumptions()
     analyzers = camera.at(wavelength_nm).analyzer_states({})[0]
     columns: dict[str, list[tuple[float, ...]]] = {name: [] for name in states}
-    for done, omega in enumerate(omega_deg, 1):
-        image = view.at(omega, pixels, pixels)
+    for done, omega in enumerate(PAPER_OMEGA_DEG, 1):
+        image = view.at(omega, PIXELS, PIXELS)
         m0 = model.mueller_jones(image.points, wavelength_nm)
         for name, stokes in states.items():
-            columns[name].append(_summary(predict_estimate(m0, image.points, analyzers, stokes, assumptions=assumed)))
-        if progress:
-            progress(done, len(omega_deg))
+            columns[name].append(
+                _summary(predict_estimate(m0, image.points, analyzers, stokes, assumptions=assumptions))
+            )
+        progress(done, len(PAPER_OMEGA_DEG))
     predictions = []
     for name, stokes in states.items():
         p90, median, lost, condition = np.array(columns[name]).T
-        predictions.append(Prediction(name, stokes, np.asarray(omega_deg, dtype=float), p90, median, lost, condition))
+        predictions.append(Prediction(name, stokes, np.array(PAPER_OMEGA_DEG), p90, median, lost, condition))
     return sorted(predictions, key=lambda p: p.score)
 
 

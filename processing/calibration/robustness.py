@@ -21,9 +21,7 @@ POLARIZATION = 0.3
 STEP = 1e-3
 
 
-def errors_of_table(
-    model: InstrumentModel, angles_deg: Mapping[str, Array], polarization: float = POLARIZATION
-) -> dict[str, float]:
+def errors_of_table(model: InstrumentModel, angles_deg: Mapping[str, Array]) -> dict[str, float]:
     """Rms error of m_ij / m00 by each kind of `ERRORS`, over samples with independent elements of that rms.
 
     An error p of W makes M wrong by pinv(W) dW/dp M; several axes or plates add in squares.
@@ -31,7 +29,7 @@ def errors_of_table(
     basis = determined_basis(model)
     w = model.rows(angles_deg).reshape(-1, 16)
     inverse = basis @ np.linalg.pinv(w @ basis)
-    prior = np.concatenate([[1.0], np.full(15, polarization)])
+    prior = np.concatenate([[1.0], np.full(15, POLARIZATION)])
 
     def rms(change: Array) -> float:
         wrong = inverse @ (change.reshape(-1, 16) * prior)

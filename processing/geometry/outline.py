@@ -39,7 +39,7 @@ class Circle:
     residual_px: float
 
 
-def find_sphere(image: ArrayLike, seed: int = 0) -> Circle:
+def find_sphere(image: ArrayLike) -> Circle:
     """Outline of the one bright sphere before a darker background.
 
     The edge is where the intensity falls most steeply along a radius; only sharp edges count, so that the
@@ -48,7 +48,6 @@ def find_sphere(image: ArrayLike, seed: int = 0) -> Circle:
     Parameters
     ----------
     image : (rows, columns), intensity; NaN counts as dark.
-    seed : of the random sample consensus.
 
     Raises
     ------
@@ -58,7 +57,7 @@ def find_sphere(image: ArrayLike, seed: int = 0) -> Circle:
     img = np.nan_to_num(np.asarray(image, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0)
     contour, inside = _bright_contour(img)
     smooth = gaussian(img, 1.0)
-    start = _consensus(_sharp(contour, smooth), inside, np.random.default_rng(seed))
+    start = _consensus(_sharp(contour, smooth), inside, np.random.default_rng(0))
     circle = start
     for _ in range(3):
         _check_frame(circle, img.shape)

@@ -16,6 +16,7 @@ from processing.geometry.pinhole import PinholeCamera
 
 #: Where the outline runs between pixels is known to about this; it moves all of the outline at once.
 OUTLINE_BIAS_PX = 0.15
+MOST_STEPS = 40
 
 #: A direction of the pose whose singular value is smaller than this part of the largest is left alone.
 IDENTIFIABLE = 0.02
@@ -41,7 +42,7 @@ class PoseFit:
     steps: int
 
 
-def refine_pose(mesh: Mesh, camera: PinholeCamera, silhouette: ArrayLike, max_steps: int = 40) -> PoseFit:
+def refine_pose(mesh: Mesh, camera: PinholeCamera, silhouette: ArrayLike) -> PoseFit:
     """Turn and move the mesh until its rim projects onto the outline of `silhouette`.
 
     Parameters
@@ -64,7 +65,7 @@ def refine_pose(mesh: Mesh, camera: PinholeCamera, silhouette: ArrayLike, max_st
         raise OutlineNotFound("the silhouette touches the border of the frame: the outline is not whole")
     distance = _signed_distance(mask)
     previous = np.inf
-    for step in range(1, max_steps + 1):
+    for step in range(1, MOST_STEPS + 1):
         rim, normal, overlap = _rim(mesh, camera, mask)
         if overlap < 0.3:
             raise OutlineNotFound(

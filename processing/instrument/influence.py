@@ -14,7 +14,7 @@ from processing.instrument.elements import Dispersive, number
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.instrument.nominal import KIND
 
-#: States at which an effect is looked at where no capture is given: enough for all unknowns, without regularity.
+#: States at which an effect is looked at: enough for all unknowns, without regularity.
 STATES = 61
 
 
@@ -37,15 +37,12 @@ class Influence:
     fitted: bool = False
 
 
-def influences(
-    model: InstrumentModel, wavelength_nm: float | None = None, conditions: Conditions | None = None
-) -> list[Influence]:
+def influences(model: InstrumentModel, wavelength_nm: float | None = None) -> list[Influence]:
     """All values that `diagnose` wrote, in the order of the file.
 
     Parameters
     ----------
     wavelength_nm : at which the change of M is taken; default: of each effect its own, else the first of the file.
-    conditions : states of a capture; default: states of no regularity.
 
     Raises
     ------
@@ -54,7 +51,9 @@ def influences(
     wavelengths = [e.wavelength_nm for e in model.effects if e.wavelength_nm is not None]
     nm = wavelength_nm or (*(model.wavelengths_nm or ()), *wavelengths, 0.0)[0]
     at = model.at(nm)
-    where = conditions or _some_states(at, STATES)
+    random = np.random.default_rng(0)
+    angles = {axis: random.uniform(0, 360, STATES) for axis in at.axes or ("none",)}
+    where = Conditions.of(angles, tuple(c.name for c in at.channels))
     result = []
     for name, stderr in model.stderr.items():
         step = at.stderr.get(name, 0.0)
@@ -106,12 +105,6 @@ def _rows(model: InstrumentModel, effects: tuple[AppliedEffect, ...], where: Con
     variant = model.model_copy(update={"effects": effects})
     changes = changes_of(variant, where)
     return variant.rows(where.angles_deg, changes)
-
-
-def _some_states(model: InstrumentModel, states: int) -> Conditions:
-    random = np.random.default_rng(0)
-    angles = {axis: random.uniform(0, 360, states) for axis in model.axes or ("none",)}
-    return Conditions.of(angles, tuple(c.name for c in model.channels))
 
 
 def _name(effect: AppliedEffect) -> str:

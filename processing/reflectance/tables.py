@@ -192,8 +192,8 @@ class ScatteringTable:
             planes["u_systematic"] = np.sqrt(np.square(self.directions).sum(axis=0))
         return planes
 
-    def lookup(self, angles: Angles, min_count: int = 1, of: Array | None = None) -> Array:
-        """Mean (quantities, ...) at directions (...) in radians, of the nearest bin; NaN with too few samples.
+    def lookup(self, angles: Angles, of: Array | None = None) -> Array:
+        """Mean (quantities, ...) at directions (...) in radians, of the nearest bin; NaN without a sample.
 
         `of` (..., bins) is looked up instead of the mean.
         """
@@ -202,7 +202,7 @@ class ScatteringTable:
         rows = np.where(bins >= 0, self._row[bins], -1)
         if self.bins.size == 0:
             return np.full((*of.shape[:-1], *rows.shape), np.nan)
-        is_filled = (rows >= 0) & (self.count[rows] >= min_count)
+        is_filled = (rows >= 0) & (self.count[rows] >= 1)
         return np.where(is_filled, of[..., rows], np.nan)
 
     def counts(self, angles: Angles) -> NDArray[np.int64]:

@@ -31,8 +31,8 @@ from processing.storage.products.product import Product, is_product
 from processing.storage.products.provenance import read_steps, steps_text
 from processing.whole_file import write_whole_text
 
-#: File types that a report takes in.
-PICTURES = (".png", ".svg")
+#: File types that a report takes in, and the media types of pictures.
+PICTURES = {".png": "image/png", ".svg": "image/svg+xml"}
 SUFFIXES = (".h5", ".csv", *PICTURES)
 #: Largest picture that a report takes in, bytes.
 MOST_PICTURE_BYTES = 64 << 20
@@ -109,7 +109,7 @@ def write_report(
             section = _curve(file)
         else:
             require_file(file, most_bytes=MOST_PICTURE_BYTES)
-            section = ReportSection(file.name, [], [Figure(file.read_bytes(), file.name, _media_type(file))])
+            section = ReportSection(file.name, [], [Figure(file.read_bytes(), file.name, PICTURES[file.suffix])])
         sections.append(section)
         if progress:
             progress(count, len(files))
@@ -283,7 +283,3 @@ def _pairs(values: dict[str, Any]) -> list[tuple[str, str]]:
 def _label(name: str) -> str:
     words = name.removesuffix("_s").replace("_", " ")
     return f"{words} / s" if name.endswith("_s") else words
-
-
-def _media_type(path: Path) -> str:
-    return {".svg": "image/svg+xml", ".png": "image/png"}[path.suffix]

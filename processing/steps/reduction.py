@@ -87,7 +87,9 @@ class Reduction(FileStep):
             self._refuse(
                 ("weighted", "covariance", "physical"), "a mosaic capture; its product holds the covariance of S always"
             )
-            options: dict[str, Any] = {"demosaic": self.demosaic or _default_method()}
+            from processing.reduction.stokes import DEFAULT_METHOD
+
+            options: dict[str, Any] = {"demosaic": self.demosaic or DEFAULT_METHOD}
         else:
             self._refuse(
                 ("demosaic", "analyzers"),
@@ -172,12 +174,6 @@ def reduce_or_open(source: Path, instrument: Path | None = None, progress: Progr
     if instrument is not None:
         raise ProcessError(f"{source} is reduced already; --instrument is for a capture. Leave it away.")
     return StepProduct(source, True)
-
-
-def _default_method() -> str:
-    from processing.reduction.stokes import DEFAULT_METHOD
-
-    return DEFAULT_METHOD
 
 
 def _flat_file(path: Path, capture: Capture) -> Path:

@@ -10,6 +10,7 @@ from processing.instrument.model import InstrumentModel
 from processing.instrument.states import RGB950_RATIO, RGB950_STATES, RGB950_STEP_DEG
 from processing.storage.captures.schema import CaptureHeader, Sample, create_layout, write_closing
 from processing.storage.integrity.checksums import row_crc32, write_checksums
+from processing.yaml_file import dump_yaml
 from simulators.bench.bench import SimulatedBench
 
 
@@ -71,7 +72,7 @@ def write_virtual_capture(
         sample=Sample(name=name),
         detector=bench.detector,
         mosaic=instrument.mosaic,
-        instrument_yaml=_yaml(instrument),
+        instrument_yaml=dump_yaml(instrument),
         seed=bench.seed,
     )
     role = ("dark",) * darks + ("sample",) * states
@@ -92,9 +93,3 @@ def write_virtual_capture(
         h5["entry/states/done"][...] = 1
         write_checksums(h5["entry"], row_crc32(frames[...]))
         write_closing(h5, "complete", {})
-
-
-def _yaml(instrument: InstrumentModel) -> str:
-    from processing.yaml_file import dump_yaml
-
-    return dump_yaml(instrument)

@@ -17,16 +17,16 @@ def _grid(bench: TrueBench) -> tuple[Array, Array]:
     return y, x
 
 
-def _spot(bench: TrueBench, random: np.random.Generator, low: float, high: float) -> tuple[float, float, float]:
-    """Centre (row, column) and radius of a spot, the radius between two shares of the image width."""
+def _spot(bench: TrueBench, random: np.random.Generator) -> tuple[float, float, float]:
+    """Centre (row, column) and radius of a spot, the radius between 0.1 and 0.3 of the image width."""
     y, x = random.uniform(0.25, 0.75, 2) * (bench.rows, bench.columns)
-    return float(y), float(x), float(random.uniform(low, high) * bench.columns)
+    return float(y), float(x), float(random.uniform(0.1, 0.3) * bench.columns)
 
 
 def drifting_spot(bench: TrueBench, random: np.random.Generator, states: int) -> Truth:
     """A part of the sample is lit by another lamp, which drifts."""
     y, x = _grid(bench)
-    y0, x0, radius = _spot(bench, random, 0.1, 0.3)
+    y0, x0, radius = _spot(bench, random)
     spot = np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / (2 * radius**2))
     size = draw_signed(random, 0.01, 0.05)
     bench.light.append(lambda k, e: e * (1 + size * spot * (k / (states - 1) - 0.5)))

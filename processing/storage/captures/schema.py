@@ -204,7 +204,8 @@ def create_layout(
 
     instrument = describe_light(entry, header.wavelength_nm, header.sample.name or header.sample.kind)
     if header.omega_deg is not None:
-        _quantity(instrument, "omega_deg", header.omega_deg, "degree")
+        instrument["omega_deg"] = float(header.omega_deg)
+        instrument["omega_deg"].attrs["units"] = "degree"
     for axis, target in target_deg.items():
         _positioner(entry, axis, np.asarray(target, dtype=np.float64), header.voltages.get(axis))
     create = frames or partial(_allocated, chunks=(1, 1, *frame_shape))
@@ -362,11 +363,6 @@ def json_bytes(value: Any) -> bytes:
     """JSON of plain values; what is not plain becomes its text."""
     # A lone surrogate, from the name of a file, becomes an escape that JSON reads.
     return json.dumps(value, ensure_ascii=False, default=str).encode(errors="backslashreplace")
-
-
-def _quantity(parent: h5py.Group, name: str, value: float, units: str) -> None:
-    parent[name] = float(value)
-    parent[name].attrs["units"] = units
 
 
 def _column(parent: h5py.Group, name: str, n: int, dtype: Any, *, fill: Any) -> h5py.Dataset:

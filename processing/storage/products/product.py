@@ -109,7 +109,7 @@ class Product(OpenH5):
         self.facts: dict[str, Any] = dict(json.loads(text_attribute(entry, "facts_json")))
         self.steps = read_steps(entry)
         data = require_group(entry, "data")
-        stored = [name for name in data if not _is_beside(name, data[name])]
+        stored = [name for name in data if name != "title" and not data[name].is_scale]
         self._stored = {FORMER_NAMES.get(name, name): name for name in stored}
         self.names: tuple[str, ...] = tuple(self._stored)
         self._kept: defaultdict[str, KeptChunks] = defaultdict(KeptChunks)
@@ -167,11 +167,6 @@ class Product(OpenH5):
 
 def _a(kind: str) -> str:
     return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
-
-
-def _is_beside(name: str, dataset: h5py.Dataset) -> bool:
-    """Whether a dataset of the plot is a coordinate or its title, and no plane."""
-    return name == "title" or dataset.is_scale
 
 
 def leading_dimensions(name: str, leading: tuple[int, ...]) -> tuple[str, ...]:

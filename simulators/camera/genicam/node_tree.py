@@ -178,10 +178,10 @@ class NodeTree:
             if self.is_true(entry, "pIsImplemented")
         }
 
-    def is_true(self, node: Element, condition: str, otherwise: bool = True) -> bool:
-        """Value of a condition of a node such as pIsImplemented."""
+    def is_true(self, node: Element, condition: str) -> bool:
+        """Value of a condition of a node such as pIsImplemented; true where it has none."""
         reference = node.findtext(condition)
-        return otherwise if reference is None else bool(self.value(reference))
+        return reference is None or bool(self.value(reference))
 
     def chosen(self, name: str) -> str:
         """Name of the entry that an Enumeration has now. Raises NodeError if its value is none of them."""
