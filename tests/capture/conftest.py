@@ -91,8 +91,8 @@ class RecordedRig:
         )
         self._exposures = 0
 
-    def note(self, *what: object) -> None:
-        self.events.append((round(self.clock.now_s(), 6), *what))
+    def note(self, *event: object) -> None:
+        self.events.append((round(self.clock.now_s(), 6), *event))
 
     def light_losses(self) -> int:
         return 0
@@ -138,8 +138,8 @@ class RecordedRig:
     def rest(self) -> None:
         self.note("rest")
 
-    def times(self, what: str) -> list[float]:
-        return [event[0] for event in self.events if event[1] == what]
+    def times(self, kind: str) -> list[float]:
+        return [event[0] for event in self.events if event[1] == kind]
 
 
 class RecordedWriter:

@@ -9,15 +9,15 @@ from acquisition.capture.free_name import free_name
 from acquisition.errors import AcquisitionError
 
 
-@pytest.mark.parametrize("taken", ["c.h5", "c.h5.partial", "c.h5.new"])
-def test_a_name_that_is_taken_gets_a_number(tmp_path, taken):
-    (tmp_path / taken).write_bytes(b"there")
+@pytest.mark.parametrize("name", ["c.h5", "c.h5.partial", "c.h5.new"])
+def test_a_name_that_is_taken_gets_a_number(tmp_path, name):
+    (tmp_path / name).write_bytes(b"there")
     with free_name(tmp_path / "c.h5") as path:
         assert path == tmp_path / "c-2.h5"
         with free_name(tmp_path / "c.h5") as another:
             assert another == tmp_path / "c-3.h5"
-    assert [there.name for there in tmp_path.iterdir()] == [taken]
-    assert (tmp_path / taken).read_bytes() == b"there"
+    assert [file.name for file in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_bytes() == b"there"
 
 
 def test_all_that_begin_at_once_get_different_names(tmp_path):

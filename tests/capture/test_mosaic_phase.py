@@ -12,9 +12,11 @@ from tests.conftest import ROOT
 
 
 def colour_camera(order: str = "RG", **settings: object) -> SimpleNamespace:
-    known = CameraSettings(offset_x=0, offset_y=0, width=20, height=16).model_copy(update=settings)
+    camera_settings = CameraSettings(offset_x=0, offset_y=0, width=20, height=16).model_copy(update=settings)
     return SimpleNamespace(
-        settings=known, bins_like_with_like=False, describe=lambda: SimpleNamespace(colours=order, polarized=False)
+        settings=camera_settings,
+        bins_like_with_like=False,
+        describe=lambda: SimpleNamespace(colours=order, polarized=False),
     )
 
 
@@ -49,7 +51,7 @@ def test_what_hides_the_colour_of_a_pixel_is_refused(instrument, setting):
 
 
 @pytest.mark.parametrize(
-    ("told", "declared", "wrong"),
+    ("analyzers", "declared", "wrong"),
     [
         ((("90", "45"), ("135", "0")), (("90", "45"), ("135", "0")), False),
         (None, (("0", "45"), ("135", "90")), False),
@@ -57,9 +59,9 @@ def test_what_hides_the_colour_of_a_pixel_is_refused(instrument, setting):
         ((("90", "45"), ("135", "0")), (("90", "135"), ("45", "0")), True),
     ],
 )
-def test_analyzers_that_the_camera_names_are_those_of_the_instrument(told, declared, wrong):
+def test_analyzers_that_the_camera_names_are_those_of_the_instrument(analyzers, declared, wrong):
     camera = colour_camera()
-    camera.describe = lambda: SimpleNamespace(colours="", analyzers=told, pixel_format="by angle")
+    camera.describe = lambda: SimpleNamespace(colours="", analyzers=analyzers, pixel_format="by angle")
     stokes = InstrumentModel.load(ROOT / "configs/instruments/linear_stokes.yaml").model_copy(
         update={"mosaic": declared}
     )

@@ -27,6 +27,6 @@ def test_noise_is_no_change_however_small_the_region_is(shape: tuple[int, int]) 
 
 @pytest.mark.parametrize("shape", [(32, 40), (600, 600)])
 def test_light_that_changes_from_place_to_place_is_told(shape: tuple[int, int]) -> None:
-    told = seen(frame(shape, 1), frame(shape, 2, slope=0.2))
-    assert told is not None
-    assert "state 1 repeats the pose of state 0" in told
+    warning = seen(frame(shape, 1), frame(shape, 2, slope=0.2))
+    assert warning is not None
+    assert "state 1 repeats the pose of state 0" in warning

@@ -344,5 +344,5 @@ def test_a_capture_without_light_says_so_once(rig, runner_of, light, times):
     rig.picture = lambda number: np.full((4, 5), 100 + (light if number > 2 else 0), np.uint16)
     psg = (0.0, 10.0, *(9.0 * k for k in range(12)))
     assert runner_of(psg=psg, role=("dark", "dark") + ("sample",) * 12, observers=(heard,)).run(range(14))
-    told = [text for text in heard.warnings if "no brighter than the dark ones: is the source on" in text]
-    assert len(told) == times
+    warnings = [text for text in heard.warnings if "no brighter than the dark ones: is the source on" in text]
+    assert len(warnings) == times

@@ -34,8 +34,8 @@ def path(tmp_path: Path) -> Path:
         repeats=np.full(STATES, 2),
     )
     CaptureWriter.create(tmp_path / "c.h5", HEADER, table, SHAPE, start_time="2026-01-01T00:00:00").abandon()
-    (left,) = tmp_path.iterdir()
-    return left
+    (file,) = tmp_path.iterdir()
+    return file
 
 
 @pytest.fixture
@@ -86,13 +86,13 @@ def test_the_disc_begins_with_an_image_while_it_is_written(path, file, monkeypat
     file.write_state(1, pixels, {"psg": (9.5, 9500), "psa": (0, 0)}, {})
     first = calls[0][1][1]
     for k, size in enumerate((16, 16, 8)):
-        (wrote, (data, offset)), (told, advice) = calls[2 * k : 2 * k + 2]
+        (wrote, (data, offset)), (call, advice) = calls[2 * k : 2 * k + 2]
         assert (wrote, offset, len(data)) == ("pwrite", first + 16 * k, size)
-        assert (told, advice) == ("posix_fadvise", (first + 16 * k, size, os.POSIX_FADV_DONTNEED))
+        assert (call, advice) == ("posix_fadvise", (first + 16 * k, size, os.POSIX_FADV_DONTNEED))
     assert "fdatasync" not in [name for name, _ in calls[:6]]
     file.close()
-    with Capture(path) as there:
-        np.testing.assert_array_equal(there.frames(0), pixels)
+    with Capture(path) as reader:
+        np.testing.assert_array_equal(reader.frames(0), pixels)
 
 
 def test_a_file_system_that_takes_no_advice_gets_the_state_as_well(path, file, monkeypatch):
@@ -102,8 +102,8 @@ def test_a_file_system_that_takes_no_advice_gets_the_state_as_well(path, file, m
     monkeypatch.setattr(os, "posix_fadvise", refuse)
     file.write_state(2, np.ones((1, *SHAPE)), {"psg": (9.5, 9500), "psa": (0, 0)}, {})
     file.close()
-    with Capture(path) as there:
-        assert there.done.tolist() == [2]
+    with Capture(path) as reader:
+        assert reader.done.tolist() == [2]
 
 
 def test_a_state_is_written_at_its_own_place(path, file):
@@ -111,14 +111,14 @@ def test_a_state_is_written_at_its_own_place(path, file):
         pixels = np.arange(20).reshape(1, *SHAPE) + 100 * k
         file.write_state(k, pixels, {"psg": (9.5 + k, 9500 + k), "psa": (-k, -1000 * k)}, {"exposure_s": 0.03 + k})
     file.close()
-    with Capture(path) as there:
-        assert there.done.tolist() == [0, 2]
-        assert there.damaged_states() == []
-        assert there.angles_deg["psg"].tolist() == [9.5, 11.5]
-        assert there.angles_deg["psa"].tolist() == [0.0, -2.0]
-        assert there.column("exposure_s").tolist() == [0.03, 2.03]
-        assert there.planned_column("exposure_s")[1] == 0.02
-        np.testing.assert_array_equal(there.frames(1), np.arange(20).reshape(1, *SHAPE) + 200)
+    with Capture(path) as reader:
+        assert reader.done.tolist() == [0, 2]
+        assert reader.damaged_states() == []
+        assert reader.angles_deg["psg"].tolist() == [9.5, 11.5]
+        assert reader.angles_deg["psa"].tolist() == [0.0, -2.0]
+        assert reader.column("exposure_s").tolist() == [0.03, 2.03]
+        assert reader.planned_column("exposure_s")[1] == 0.02
+        np.testing.assert_array_equal(reader.frames(1), np.arange(20).reshape(1, *SHAPE) + 200)
     with h5py.File(path) as h5:
         assert h5["entry/instrument/psg/raw_value"][...].tolist()[0::2] == [9500, 9502]
 
@@ -161,11 +161,11 @@ def test_a_record_is_cut_to_its_part_of_the_room_and_a_full_journal_is_told(file
     used = raw.journal_end
     assert 0.4 * room < used <= 0.5 * room
     # A line as long as the room takes all of it, one byte more does not fit, and nothing is written then.
-    left = room - used - LINE_BYTES - len('{"t": ""}')
+    part = room - used - LINE_BYTES - len('{"t": ""}')
     with pytest.raises(AcquisitionError, match="its journal is full"):
-        file.add_segment_record({"t": "x" * (left + 1)})
+        file.add_segment_record({"t": "x" * (part + 1)})
     assert raw.journal_end == used
-    file.add_segment_record({"t": "x" * left})
+    file.add_segment_record({"t": "x" * part})
     assert raw.journal_end == room
     with pytest.raises(AcquisitionError, match="its journal is full"):
         file.add_segment_record({}, part=0.5)
@@ -177,9 +177,9 @@ def test_closing_record_and_status_are_replaced(path, file):
     file.write_status("aborted")
     file.write_status("failed")
     file.close()
-    with Capture(path) as there:
-        assert there.closing == {"end_time": "now"}
-        assert there.status == "failed"
+    with Capture(path) as reader:
+        assert reader.closing == {"end_time": "now"}
+        assert reader.status == "failed"
 
 
 def _texts(path):
@@ -209,21 +209,21 @@ def test_a_text_that_is_cut_off_anywhere_reads_as_before_or_as_it_is_now(path, f
     before, now = ({"end_time": text} for text in records)
     file.write_closing(before)
     file.add_segment_record(before)
-    sync, seen = file.sync, []
+    sync, closings = file.sync, []
 
     def look():
         copy = Path(shutil.copy(path, path.with_name("copy.h5")))
-        with Capture(copy) as there:
-            assert there.closing in (before, now)
+        with Capture(copy) as reader:
+            assert reader.closing in (before, now)
             assert file.segment_records() in ([before], [before, now])
-            seen.append(there.closing)
+            closings.append(reader.closing)
 
     monkeypatch.setattr(file, "sync", lambda: (sync(), look()))
     file.write_closing(now)
     file.add_segment_record(now)
     # Two steps each: the length of a text, and what stands in it.
-    assert len(seen) == 4
-    assert seen[-1] == now
+    assert len(closings) == 4
+    assert closings[-1] == now
 
 
 def test_padded_texts_of_an_older_file_are_gone_on_with(path, file, raw):
@@ -232,8 +232,8 @@ def test_padded_texts_of_an_older_file_are_gone_on_with(path, file, raw):
     for box in (raw.segments, raw.closing):
         box.set_length(raw.descriptor, box.room)
     file.close()
-    with Capture(path) as there:
-        assert there.closing == {}
+    with Capture(path) as reader:
+        assert reader.closing == {}
     with contextlib.closing(StateFile(path)) as older:
         assert older.segment_records() == [{"event": "begin"}]
         older.add_segment_record({"event": "end"})
@@ -246,8 +246,8 @@ def test_padded_texts_of_an_older_file_are_gone_on_with(path, file, raw):
 def test_a_closing_record_that_is_too_long_says_what_it_lost(path, file):
     file.write_closing({"end_time": "now", "messages": ["m" * 1000] * 5000})
     file.close()
-    with Capture(path) as there:
-        assert there.closing["left_out"]["messages"] > 0
+    with Capture(path) as reader:
+        assert reader.closing["left_out"]["messages"] > 0
 
 
 def test_it_knows_whether_it_is_still_the_file_of_its_name(path, file):

@@ -83,11 +83,11 @@ def calls(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFact
 
     def seen() -> list[tuple[Any, ...]]:
         with record.open("rb") as file:
-            found = []
+            records = []
             while file.peek():
-                found.append(pickle.load(file))
+                records.append(pickle.load(file))
         record.write_bytes(b"")
-        return found
+        return records
 
     return seen
 
@@ -99,27 +99,27 @@ def test_a_state_is_synced_before_it_is_marked_done_and_the_mark_after(create, c
     calls()
     writer.put(record(1))
     writer.settle()
-    seen = calls()
-    names = [call[0] for call in seen]
+    records = calls()
+    names = [call[0] for call in records]
     assert names[-3:] == ["fdatasync", "pwrite", "fdatasync"]
     assert "fdatasync" not in names[:-3]
-    assert seen[-2][1] == mark + seen[-2][2].__len__()
-    assert any(call[0] == "pwrite" and record(1).pixels.tobytes() in call[2] for call in seen[:-3])
+    assert records[-2][1] == mark + records[-2][2].__len__()
+    assert any(call[0] == "pwrite" and record(1).pixels.tobytes() in call[2] for call in records[:-3])
     # Nothing of the state is written after its mark.
-    assert int.from_bytes(seen[-2][2], "little") == 1
+    assert int.from_bytes(records[-2][2], "little") == 1
 
 
 def test_the_file_has_its_final_name_when_all_is_on_the_disc(create, calls, tmp_path):
     writer = create()
-    seen = calls()
-    assert ("fsync", "c.h5.new") in seen
-    assert seen.index(("fsync", "c.h5.new")) < seen.index(("rename", "c.h5.new", "c.h5.partial"))
-    assert seen[-1] == ("fsync", tmp_path.name)
+    records = calls()
+    assert ("fsync", "c.h5.new") in records
+    assert records.index(("fsync", "c.h5.new")) < records.index(("rename", "c.h5.new", "c.h5.partial"))
+    assert records[-1] == ("fsync", tmp_path.name)
     assert writer.seal("complete", {"end_time": "now"}) == tmp_path / "c.h5"
     # The closing record and the status are synced before the file has its name, and its folder after.
-    seen = calls()
-    assert seen[-3][0] in ("fdatasync", "fsync")
-    assert seen[-2:] == [("rename", "c.h5.partial", "c.h5"), ("fsync", tmp_path.name)]
+    records = calls()
+    assert records[-3][0] in ("fdatasync", "fsync")
+    assert records[-2:] == [("rename", "c.h5.partial", "c.h5"), ("fsync", tmp_path.name)]
     assert writer.path == tmp_path / "c.h5"
 
 
@@ -185,8 +185,8 @@ def test_states_to_be_taken_again_make_the_capture_partial(create):
 def test_nothing_is_overwritten(create, tmp_path):
     (tmp_path / "c.h5").write_bytes(b"whole")
     (tmp_path / "d.h5.partial").write_bytes(b"part")
-    for name, there in (("c.h5", "c.h5"), ("d.h5", "d.h5.partial")):
-        with pytest.raises(AcquisitionError, match=rf"{there} exists already; nothing was changed"):
+    for name, existing in (("c.h5", "c.h5"), ("d.h5", "d.h5.partial")):
+        with pytest.raises(AcquisitionError, match=rf"{existing} exists already; nothing was changed"):
             create(name)
     assert (tmp_path / "c.h5").read_bytes() == b"whole"
     assert not list(tmp_path.glob("*.new"))
@@ -226,7 +226,7 @@ def test_the_blocks_are_taken_before_the_first_state(create):
 
 
 def test_an_error_of_the_disc_is_told_at_once_and_by_the_next_call(create, monkeypatch):
-    told: list[AcquisitionError] = []
+    errors: list[AcquisitionError] = []
     heard = threading.Event()
 
     def fail(*_: object) -> None:
@@ -234,10 +234,10 @@ def test_an_error_of_the_disc_is_told_at_once_and_by_the_next_call(create, monke
 
     monkeypatch.setattr(StateFile, "write_state", fail)
     writer = create()
-    writer.on_failure = lambda error: (told.append(error), heard.set())
+    writer.on_failure = lambda error: (errors.append(error), heard.set())
     writer.put(record(0))
     heard.wait()
-    assert "could not be written ([Errno 5] Input/output error)" in str(told[0])
+    assert "could not be written ([Errno 5] Input/output error)" in str(errors[0])
     for call in (lambda: writer.put(record(1)), writer.settle, lambda: writer.seal("complete", {})):
         with pytest.raises(AcquisitionError, match=r"Input/output error\). States done before it are intact"):
             call()
@@ -319,15 +319,15 @@ def test_a_disc_that_takes_nothing_is_given_up_after_a_while_and_the_next_state_
 
 
 def test_a_disc_that_blocks_while_nobody_hands_over_a_state_is_told_of(create, monkeypatch):
-    told: list[AcquisitionError] = []
+    errors: list[AcquisitionError] = []
     heard, going_on = threading.Event(), multiprocessing.Event()
     write = StateFile.write_state
     monkeypatch.setattr(StateFile, "write_state", lambda *arguments: (going_on.wait(), write(*arguments)))
     writer = create(clock=Passing())
-    writer.on_failure = lambda error: (told.append(error), heard.set())
+    writer.on_failure = lambda error: (errors.append(error), heard.set())
     writer.put(record(0))
     assert heard.wait(60)
-    assert f"the disc has not taken a state for {DEAD_S:g} s" in str(told[0])
+    assert f"the disc has not taken a state for {DEAD_S:g} s" in str(errors[0])
     going_on.set()
 
 
