@@ -57,13 +57,13 @@ class DescribedCamera:
         """Add a Boolean."""
         self.add(name, f'<Boolean Name="{name}">VALUE<OnValue>1</OnValue><OffValue>0</OffValue></Boolean>', access)
 
-    def play(self, bits: int = 12, **left: Number | str) -> GigeCamera:
+    def play(self, bits: int = 12, **features: Number | str) -> GigeCamera:
         """Start the camera, with the named features as another program left them."""
         self._path.write_text(self.text)
         camera = self._stack.enter_context(
             GigeCamera("LEFT-1", *self._size, self._source, description=self._path, bits=bits, complete=False)
         )
-        for name, value in left.items():
+        for name, value in features.items():
             camera.leave(name, value)
         return camera
 

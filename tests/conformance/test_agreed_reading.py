@@ -9,9 +9,9 @@ from drivers.errors import ReplyError
 
 
 def _read(readings: AgreeingReadings, values: list[float], *, moving: bool = False) -> tuple[tuple[float, bool], int]:
-    left = list(values)
-    answer = readings.read("axis a, read position", lambda: left.pop(0), lambda: moving, 0.005)
-    return answer, len(values) - len(left)
+    queue = list(values)
+    answer = readings.read("axis a, read position", lambda: queue.pop(0), lambda: moving, 0.005)
+    return answer, len(values) - len(queue)
 
 
 def test_two_are_enough_on_a_calm_line_and_one_that_stands_alone_is_not_believed() -> None:
@@ -28,8 +28,8 @@ def test_a_disturbed_line_is_remembered() -> None:
 
 
 def test_a_servo_trembles_within_its_tolerance() -> None:
-    (value, confirmed), asked = _read(AgreeingReadings(), [10.001, 10.003, 10.002, 10.0])
-    assert (value, confirmed, asked) == (10.002, True, 3)
+    (value, confirmed), count = _read(AgreeingReadings(), [10.001, 10.003, 10.002, 10.0])
+    assert (value, confirmed, count) == (10.002, True, 3)
 
 
 def test_an_axis_in_motion_is_said_to_move() -> None:

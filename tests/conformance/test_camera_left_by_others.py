@@ -33,22 +33,22 @@ class Left(DescribedCamera):
 
 
 @pytest.fixture
-def left(tmp_path: Path) -> Iterator[Left]:
+def used(tmp_path: Path) -> Iterator[Left]:
     with ExitStack() as stack:
         yield Left(tmp_path, stack)
 
 
 @pytest.mark.parametrize("access", ["RW", "RO"])
-def test_the_bench_rests_until_a_delayed_exposure_has_ended(left: Left, access: str) -> None:
+def test_the_bench_rests_until_a_delayed_exposure_has_ended(used: Left, access: str) -> None:
     old = "<Min>16</Min><Max>1000</Max></Float>"
-    assert old in left.text
-    left.text = left.text.replace(old, "<Min>16</Min><Max>1000000</Max></Float>")
-    where, named = left.text.split('<FloatReg Name="TriggerDelayReg">')
-    left.text = where + '<FloatReg Name="TriggerDelayReg">' + named.replace("RW", access, 1)
-    simulated = left.play()
+    assert old in used.text
+    used.text = used.text.replace(old, "<Min>16</Min><Max>1000000</Max></Float>")
+    where, named = used.text.split('<FloatReg Name="TriggerDelayReg">')
+    used.text = where + '<FloatReg Name="TriggerDelayReg">' + named.replace("RW", access, 1)
+    simulated = used.play()
     with simulated._nodes.assuming("TriggerSelector", "FrameStart"):
         simulated.leave("TriggerDelay", 150_000.0)
-    camera = left.open()
+    camera = used.open()
     if access == "RO":
         with pytest.raises(SettingRefused, match="TriggerDelay is 150000"):
             camera.configure(LIGHT)
@@ -61,10 +61,10 @@ def test_the_bench_rests_until_a_delayed_exposure_has_ended(left: Left, access: 
     assert float(camera.node_map()["TriggerDelay"]) == 16.0
 
 
-def test_a_delay_that_is_wanted_is_waited_for(left: Left) -> None:
-    left.text = left.text.replace("<Min>16</Min><Max>1000</Max></Float>", "<Min>16</Min><Max>1000000</Max></Float>")
-    simulated = left.play()
-    camera = left.open(features={"TriggerSelector": "FrameStart", "TriggerDelay": 150_000})
+def test_a_delay_that_is_wanted_is_waited_for(used: Left) -> None:
+    used.text = used.text.replace("<Min>16</Min><Max>1000</Max></Float>", "<Min>16</Min><Max>1000000</Max></Float>")
+    simulated = used.play()
+    camera = used.open(features={"TriggerSelector": "FrameStart", "TriggerDelay": 150_000})
     camera.configure(LIGHT)
     exposure = camera.trigger()
     exposure.wait_exposed()
@@ -83,96 +83,96 @@ def test_a_delay_that_is_wanted_is_waited_for(left: Left) -> None:
     ],
 )
 def test_a_mode_that_spoils_frames_is_off_or_the_capture_is_refused(
-    left: Left, name: str, entries: tuple[str, ...]
+    used: Left, name: str, entries: tuple[str, ...]
 ) -> None:
-    left.choice(name, *entries)
-    left.play(**{name: entries[0]})
-    camera = left.open()
+    used.choice(name, *entries)
+    used.play(**{name: entries[0]})
+    camera = used.open()
     camera.configure(LIGHT)
     for frame in camera.capture(3):
         np.testing.assert_array_equal(frame.pixels, SEEN)
-    assert {info.exposure_s for info in left.infos} == {5e-3}
+    assert {info.exposure_s for info in used.infos} == {5e-3}
     assert camera.node_map()[name] == "Off"
 
 
 @pytest.mark.parametrize("name", ["BalanceWhiteAuto", "TestPattern", "SequencerMode"])
-def test_one_that_cannot_be_set_is_named(left: Left, name: str) -> None:
-    left.choice(name, "Other", "Off", access="RO")
-    left.play(**{name: "Other"})
+def test_one_that_cannot_be_set_is_named(used: Left, name: str) -> None:
+    used.choice(name, "Other", "Off", access="RO")
+    used.play(**{name: "Other"})
     with pytest.raises(SettingRefused, match=f"{name} is Other and could not be set to Off"):
-        left.open().configure(LIGHT)
+        used.open().configure(LIGHT)
 
 
-def test_a_binning_by_words_is_undone(left: Left) -> None:
+def test_a_binning_by_words_is_undone(used: Left) -> None:
     for axis in ("Horizontal", "Vertical"):
-        left.text = left.text.replace(f'Name="Binning{axis}"', f'Name="Other{axis}"')
-        left.text = left.text.replace(f"<pFeature>Binning{axis}</pFeature>", "")
-        left.choice(f"Binning{axis}", "X1", "X2", "X4")
-    left.play(BinningVertical="X4")
-    camera = left.open()
+        used.text = used.text.replace(f'Name="Binning{axis}"', f'Name="Other{axis}"')
+        used.text = used.text.replace(f"<pFeature>Binning{axis}</pFeature>", "")
+        used.choice(f"Binning{axis}", "X1", "X2", "X4")
+    used.play(BinningVertical="X4")
+    camera = used.open()
     assert camera.configure(LIGHT).binning == 1
     assert camera.node_map()["BinningVertical"] == "X1"
 
 
-def test_a_digital_shift_is_undone(left: Left) -> None:
-    left.add("DigitalShift", '<Integer Name="DigitalShift">VALUE<Min>0</Min><Max>4</Max></Integer>')
-    left.play(DigitalShift=2)
-    camera = left.open()
+def test_a_digital_shift_is_undone(used: Left) -> None:
+    used.add("DigitalShift", '<Integer Name="DigitalShift">VALUE<Min>0</Min><Max>4</Max></Integer>')
+    used.play(DigitalShift=2)
+    camera = used.open()
     camera.configure(LIGHT)
     np.testing.assert_array_equal(camera.capture()[0].pixels, SEEN)
 
 
-@pytest.mark.parametrize(("unit", "said"), [("x", None), ("", "factor"), ("dB", None), ("", "dB")])
-def test_six_decibels_are_six_decibels_in_any_unit(left: Left, unit: str, said: str | None) -> None:
-    low, high = ("0", "24") if "dB" in (unit, said) else ("1", "16")
+@pytest.mark.parametrize(("unit", "rig_unit"), [("x", None), ("", "factor"), ("dB", None), ("", "dB")])
+def test_six_decibels_are_six_decibels_in_any_unit(used: Left, unit: str, rig_unit: str | None) -> None:
+    low, high = ("0", "24") if "dB" in (unit, rig_unit) else ("1", "16")
     new = f"<Min>{low}</Min><Max>{high}</Max>" + (f"<Unit>{unit}</Unit>" if unit else "")
-    left.text = left.text.replace("<Min>0</Min><Max>24</Max><Unit>dB</Unit>", new)
-    simulated = left.play()
-    back = left.open(gain_unit=said).configure(LIGHT.model_copy(update={"gain_db": 6.0}))
+    used.text = used.text.replace("<Min>0</Min><Max>24</Max><Unit>dB</Unit>", new)
+    simulated = used.play()
+    back = used.open(gain_unit=rig_unit).configure(LIGHT.model_copy(update={"gain_db": 6.0}))
     assert back.gain_db == pytest.approx(6.0, abs=1e-3)
-    assert simulated._nodes.value("Gain") == pytest.approx(6.0 if "dB" in (unit, said) else 1.9953, abs=1e-3)
+    assert simulated._nodes.value("Gain") == pytest.approx(6.0 if "dB" in (unit, rig_unit) else 1.9953, abs=1e-3)
 
 
-def test_a_gain_without_a_unit_is_refused(left: Left) -> None:
-    left.text = left.text.replace("<Unit>dB</Unit>", "")
-    left.play()
+def test_a_gain_without_a_unit_is_refused(used: Left) -> None:
+    used.text = used.text.replace("<Unit>dB</Unit>", "")
+    used.play()
     with pytest.raises(SettingRefused, match="gain_unit: factor"):
-        left.open().configure(LIGHT.model_copy(update={"gain_db": 6.0}))
+        used.open().configure(LIGHT.model_copy(update={"gain_db": 6.0}))
 
 
-def test_the_frame_rate_is_lowered_for_an_exposure_that_it_limits(left: Left) -> None:
+def test_the_frame_rate_is_lowered_for_an_exposure_that_it_limits(used: Left) -> None:
     # Lucid: 44.6 ms by default, 199.8 ms at 5 frames a second.
-    left.flag("AcquisitionFrameRateEnable")
-    left.add(
+    used.flag("AcquisitionFrameRateEnable")
+    used.add(
         "AcquisitionFrameRate",
         '<Float Name="AcquisitionFrameRate">VALUE<Min>0.5</Min><Max>22</Max><Unit>Hz</Unit></Float>',
         kind="FloatReg",
         length=8,
     )
-    left.text = left.text.replace(
+    used.text = used.text.replace(
         "<pMax>ExposureMost</pMax><Unit>us</Unit></Float>",
         '<pMax>ExposureByRate</pMax><Unit>us</Unit></Float><SwissKnife Name="ExposureByRate"><pVariable Name="ON">'
         'AcquisitionFrameRateEnableAt</pVariable><pVariable Name="RATE">AcquisitionFrameRateAt</pVariable>'
         "<Formula>(ON=1)?(1000000/RATE-200):44600</Formula></SwissKnife>",
     )
-    left.play(AcquisitionFrameRate=22.0)
-    camera = left.open()
+    used.play(AcquisitionFrameRate=22.0)
+    camera = used.open()
     assert camera.configure(LIGHT).exposure_s == 5e-3
     # In the midst of a capture, as a bracket does.
     for exposure_s in (0.2, 0.01, 0.25):
         back = camera.configure(LIGHT.model_copy(update={"exposure_s": exposure_s}))
         assert back.exposure_s == pytest.approx(exposure_s, rel=1e-3)
         camera.capture()
-        assert left.infos[-1].exposure_s == pytest.approx(exposure_s, rel=1e-3)
+        assert used.infos[-1].exposure_s == pytest.approx(exposure_s, rel=1e-3)
     with pytest.raises(SettingRefused, match="its limits are"):
         camera.configure(LIGHT.model_copy(update={"exposure_s": 3.0}))
 
 
 @pytest.mark.parametrize("choosable", [True, False])
-def test_the_converter_has_the_bits_of_the_format_or_counts_end_where_it_ends(left: Left, choosable: bool) -> None:
-    left.choice("AdcBitDepth", "Bit8", "Bit10", "Bit12", access="RW" if choosable else "RO")
-    left.play(AdcBitDepth="Bit10")
-    camera = left.open()
+def test_the_converter_has_the_bits_of_the_format_or_counts_end_where_it_ends(used: Left, choosable: bool) -> None:
+    used.choice("AdcBitDepth", "Bit8", "Bit10", "Bit12", access="RW" if choosable else "RO")
+    used.play(AdcBitDepth="Bit10")
+    camera = used.open()
     camera.configure(LIGHT)
     (frame,) = camera.capture()
     assert (camera.top_of_counts.step, camera.full_scale) == ((1, 4095) if choosable else (4, 4092))
@@ -180,12 +180,12 @@ def test_the_converter_has_the_bits_of_the_format_or_counts_end_where_it_ends(le
 
 
 @pytest.mark.parametrize("loads", ["UserSetLoad", "UserSetSave"])
-def test_a_feature_of_unknown_meaning_is_at_its_default_or_named(left: Left, loads: str) -> None:
-    left.choice("UserSetSelector", "Default", "UserSet1")
-    left.add(loads, f'<Command Name="{loads}">VALUE<CommandValue>1</CommandValue></Command>')
-    left.choice("ShotMixing", "Plain", "Mixed")
-    left.play(ShotMixing="Mixed", UserSetSelector="UserSet1")
-    camera = left.open()
+def test_a_feature_of_unknown_meaning_is_at_its_default_or_named(used: Left, loads: str) -> None:
+    used.choice("UserSetSelector", "Default", "UserSet1")
+    used.add(loads, f'<Command Name="{loads}">VALUE<CommandValue>1</CommandValue></Command>')
+    used.choice("ShotMixing", "Plain", "Mixed")
+    used.play(ShotMixing="Mixed", UserSetSelector="UserSet1")
+    camera = used.open()
     camera.configure(LIGHT)
     if loads == "UserSetLoad":
         assert (camera.node_map()["ShotMixing"], camera.warnings()) == ("Plain", [])
@@ -195,13 +195,13 @@ def test_a_feature_of_unknown_meaning_is_at_its_default_or_named(left: Left, loa
         assert "ShotMixing" in text
 
 
-def test_a_load_that_changes_nothing_is_seen(left: Left) -> None:
-    left.choice("UserSetSelector", "Default")
-    left.add("UserSetLoad", '<Command Name="UserSetLoad">VALUE<CommandValue>1</CommandValue></Command>')
-    left.choice("ShotMixing", "Plain", "Mixed")
-    simulated = left.play(ShotMixing="Mixed")
+def test_a_load_that_changes_nothing_is_seen(used: Left) -> None:
+    used.choice("UserSetSelector", "Default")
+    used.add("UserSetLoad", '<Command Name="UserSetLoad">VALUE<CommandValue>1</CommandValue></Command>')
+    used.choice("ShotMixing", "Plain", "Mixed")
+    simulated = used.play(ShotMixing="Mixed")
     simulated._features.heard = lambda *_: []  # type: ignore[method-assign]
-    camera = left.open()
+    camera = used.open()
     camera.configure(LIGHT)
     (text,) = camera.warnings()
     assert "changed nothing" in text
@@ -209,15 +209,15 @@ def test_a_load_that_changes_nothing_is_seen(left: Left) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "reason"),
     [
         ("TriggerMode", "ExposureControl", "it has no TriggerMode"),
         ("FrameStart", "LineStart", "its TriggerSelector offers only AcquisitionStart, LineStart"),
     ],
 )
-def test_a_camera_that_no_trigger_makes_expose_is_named_so(left: Left, old: str, new: str, said: str) -> None:
-    left.text = left.text.replace(old, new)
-    left.play()
-    with pytest.raises(SettingRefused, match=f"one frame at each trigger: {said}.*Use a camera") as caught:
-        left.open().configure(LIGHT)
+def test_a_camera_that_no_trigger_makes_expose_is_named_so(used: Left, old: str, new: str, reason: str) -> None:
+    used.text = used.text.replace(old, new)
+    used.play()
+    with pytest.raises(SettingRefused, match=f"one frame at each trigger: {reason}.*Use a camera") as caught:
+        used.open().configure(LIGHT)
     assert "arv-tool" not in str(caught.value)

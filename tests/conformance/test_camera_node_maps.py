@@ -132,17 +132,17 @@ def test_features_of_the_rig_file_are_set_and_the_node_map_tells_them(maker: Mak
     table = maker.table
     if table.ptp is None or table.gamma is None:
         pytest.skip("this camera has neither clock synchronization nor gamma")
-    wanted = {table.ptp: True, "GammaEnable": True, "Gamma": 0.5, "TriggerActivation": "FallingEdge"}
-    camera = maker.open(features=wanted, bits=8)
+    settings = {table.ptp: True, "GammaEnable": True, "Gamma": 0.5, "TriggerActivation": "FallingEdge"}
+    camera = maker.open(features=settings, bits=8)
     camera.configure(CameraSettings(exposure_s=1e-3))
-    found = camera.node_map()
-    assert found[table.ptp] == "true"
-    assert (found["GammaEnable"], float(found["Gamma"])) == ("true", 0.5)
-    assert found["TriggerActivation"] == "FallingEdge"
-    assert found["DeviceModelName"] == table.model
-    assert float(found[table.exposure]) == pytest.approx(1000.0)
-    assert {"PtpStatus", "GevIEEE1588Status"} & found.keys()
-    assert "TriggerSoftware" not in found
+    features = camera.node_map()
+    assert features[table.ptp] == "true"
+    assert (features["GammaEnable"], float(features["Gamma"])) == ("true", 0.5)
+    assert features["TriggerActivation"] == "FallingEdge"
+    assert features["DeviceModelName"] == table.model
+    assert float(features[table.exposure]) == pytest.approx(1000.0)
+    assert {"PtpStatus", "GevIEEE1588Status"} & features.keys()
+    assert "TriggerSoftware" not in features
 
 
 def test_the_time_of_an_exposure_comes_from_behind_the_image_where_the_camera_sends_it() -> None:
@@ -203,12 +203,19 @@ def test_a_feature_that_is_not_taken_is_refused(wrong: dict[str, object], says: 
 
 
 def test_features_of_every_kind_are_set() -> None:
-    wanted = {"DeviceUserID": "bench 4", "GevSCPD": 12, "Gamma": 0.5, "PtpEnable": True, "GainAuto": "Once", "Gain": 3}
+    settings = {
+        "DeviceUserID": "bench 4",
+        "GevSCPD": 12,
+        "Gamma": 0.5,
+        "PtpEnable": True,
+        "GainAuto": "Once",
+        "Gain": 3,
+    }
     with ExitStack() as stack:
-        camera = MakersCamera("loopback", stack).open(features=wanted, bits=8)
+        camera = MakersCamera("loopback", stack).open(features=settings, bits=8)
         assert camera.configure(CameraSettings(exposure_s=1e-3)).gain_db == 3.0
-        found = camera.node_map()
-        assert {name: found[name] for name in wanted} == {
+        features = camera.node_map()
+        assert {name: features[name] for name in settings} == {
             **{"DeviceUserID": "bench 4", "GevSCPD": "12", "Gamma": "0.5"},
             **{"PtpEnable": "true", "GainAuto": "Once", "Gain": "3"},
         }

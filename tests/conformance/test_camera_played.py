@@ -56,12 +56,12 @@ def test_settings_reach_the_exposure_through_registers_formulas_and_converters(s
     shown = Shown()
     played(stack, shown=shown)
     camera = opened(stack)
-    wanted = CameraSettings(
+    settings = CameraSettings(
         **{"exposure_s": 3e-3, "gain_db": 6.5, "black_level": 40, "pixel_format": "Mono12p", "reverse_x": True},
         **{"width": 24, "height": 10, "offset_x": 4, "offset_y": 3, "binning": 2},
     )
-    back = camera.configure(wanted)
-    assert back.model_dump(include=wanted.model_fields_set) == wanted.model_dump(exclude_unset=True)
+    back = camera.configure(settings)
+    assert back.model_dump(include=settings.model_fields_set) == settings.model_dump(exclude_unset=True)
     (frame,) = camera.capture()
     (info,) = shown.infos
     assert info == ExposureInfo(3e-3, 6.5, 40.0, 1, 24, 10, 4, 3, binning=2, reverse_x=True)
@@ -187,7 +187,7 @@ def test_what_cannot_be_played_is_refused_with_the_name_of_the_feature(
 
 def test_spoilt_descriptions_are_played_or_refused(tmp_path: Path) -> None:
     path, text = tmp_path / "maker.xml", STYLE.read_text()
-    values = [found.span(1) for found in re.finditer(r">([^<>\n]+)<", text)]
+    values = [match.span(1) for match in re.finditer(r">([^<>\n]+)<", text)]
     spoilt = ["", "0", "-1", "nan", "1e400", "0xFFFFFFFFFFFFFFFF", "9" * 40, "2.5", "GainReg", "Width", "A/0"]
     rng = np.random.default_rng(5)
     refused = 0

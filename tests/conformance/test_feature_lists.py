@@ -80,8 +80,8 @@ def read_list(text: str) -> dict[str, tuple[str, bool, list[str]]]:
             continue
         letter, writable, entries = features.get(named[2], (named[1], False, []))
         writable |= record in ("ao", "bo", "mbbo", "longout", "stringout")
-        found = [re.sub(r"\W", "_", entry) for entry in ORDINALS.findall(body)]
-        features[named[2]] = letter, writable and not OWN.fullmatch(named[2]), list(dict.fromkeys(found)) or entries
+        ordinals = [re.sub(r"\W", "_", entry) for entry in ORDINALS.findall(body)]
+        features[named[2]] = letter, writable and not OWN.fullmatch(named[2]), list(dict.fromkeys(ordinals)) or entries
     return features
 
 
@@ -125,8 +125,8 @@ class ListedCamera(DescribedCamera):
             low, high = (round(low), round(high)) if letter == "I" else (low, high)
             unit = "us" if re.match("ExposureT|TriggerD", name) else ""
             unit = self._gain[0] if name in ("Gain", "GainAbs") else unit
-            told = f"<Unit>{unit}</Unit>" if unit and kind == "Float" else ""
-            node = f'<{kind} Name="{name}">VALUE<Min>{low}</Min><Max>{high}</Max>{told}</{kind}>'
+            unit_node = f"<Unit>{unit}</Unit>" if unit and kind == "Float" else ""
+            node = f'<{kind} Name="{name}">VALUE<Min>{low}</Min><Max>{high}</Max>{unit_node}</{kind}>'
             self.add(name, node, access, register, length, index)
 
     def left_values(self) -> dict[str, float | int | str]:
@@ -159,8 +159,8 @@ def test_frames_are_right_or_the_camera_is_refused_in_words(path: Path, tmp_path
     rng = np.random.default_rng([int(os.environ.get("FEATURE_SEED", "1")), zlib.crc32(path.stem.encode())])
     with ExitStack() as stack:
         listed = ListedCamera(path, tmp_path, stack, rng)
-        known = [FORMATS[entry] for entry in listed.features["PixelFormat"][2] if entry in FORMATS]
-        fmt = known[int(rng.integers(len(known)))]
+        formats = [FORMATS[entry] for entry in listed.features["PixelFormat"][2] if entry in FORMATS]
+        fmt = formats[int(rng.integers(len(formats)))]
         listed.bits = fmt.bits
         camera = listed.play(bits=fmt.bits)
         for name, value in listed.left_values().items():

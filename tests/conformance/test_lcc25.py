@@ -172,7 +172,7 @@ def test_a_capture_of_named_states(
 
 
 @pytest.mark.parametrize(
-    ("states", "told"),
+    ("states", "message"),
     [
         ("[quarter, fifth]", "axis lcr has no state 'fifth', only: low, quarter, half, high"),
         ("[1.2, 1.53, 2.2, 9.0, 9.0, 30]", "limits are 0 to 10 V"),
@@ -180,15 +180,15 @@ def test_a_capture_of_named_states(
     ],
 )
 def test_what_is_refused(
-    crystal_rig: Path, tmp_path: Path, states: str, told: str, acquire: Callable[..., tuple[int, str, str]]
+    crystal_rig: Path, tmp_path: Path, states: str, message: str, acquire: Callable[..., tuple[int, str, str]]
 ) -> None:
-    if "voltage" in told:
+    if "voltage" in message:
         (tmp_path / "crystal.yaml").write_text("kind: instrument\nname: none\ngenerator: []\nanalyzer: []\n")
-    elif "limits" in told:
+    elif "limits" in message:
         text = (tmp_path / "crystal.yaml").read_text()
         (tmp_path / "crystal.yaml").write_text(text.replace("tolerance_deg: 0.01", "tolerance_deg: 100"))
     change_yaml(crystal_rig, lambda tree: tree["axes"]["lcr"].update({"limits_deg": [0, 10]}))
     plan = tmp_path / "plan.yaml"
     plan.write_text(f"{PLAN}states: {{kind: table, angles: {{lcr: {states}}}}}\n")
     code, _, err = acquire("--plan", plan, "--rig", crystal_rig, "--out", tmp_path / "taken", "--yes")
-    assert (code != 0, told in " ".join(err.split())) == (True, True), err
+    assert (code != 0, message in " ".join(err.split())) == (True, True), err
