@@ -108,11 +108,11 @@ def test_stopped_campaign_goes_on_with_the_state_it_stopped_at(acquire, small_ri
 def test_a_door_open_between_captures(acquire, small_rig, campaign, tmp_path, monkeypatch, goes_on):
     from acquisition.campaign.run import CampaignRun
 
-    take, taken = CampaignRun._take, []
+    take, names = CampaignRun._take, []
 
     def opened_before_the_second(self, capture, job):
-        taken.append(capture.name)
-        if len(taken) == 2:
+        names.append(capture.name)
+        if len(names) == 2:
             shutter = self.rig.simulation.emulators["shutter"]
             shutter.trip(True)
             threading.Timer(0.5, shutter.trip, (False,)).start()
@@ -132,13 +132,13 @@ def test_books_that_a_full_disc_cut_off_are_caught_up(acquire, small_rig, campai
     arguments = ("--campaign", file, "--rig", small_rig(), "--out", tmp_path)
     assert acquire(*arguments)[0] == 0
     index, log = tmp_path / "small" / "index.json", tmp_path / "small" / "log.jsonl"
-    whole = json.loads(index.read_text())
-    index.write_text(json.dumps({name: {"status": "running"} for name in list(whole)[:1]}))
+    books = json.loads(index.read_text())
+    index.write_text(json.dumps({name: {"status": "running"} for name in list(books)[:1]}))
     log.write_text(log.read_text()[:-30])
     code, out, err = acquire(*arguments)
     assert code == 0, err
     assert "2 of 2 captures complete" in out
-    assert json.loads(index.read_text()) == whole
+    assert json.loads(index.read_text()) == books
     assert json.loads(log.read_text().splitlines()[-1])["event"] == "campaign complete"
 
 

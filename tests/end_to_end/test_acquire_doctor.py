@@ -25,8 +25,8 @@ def changed(small_rig, tmp_path):
         yield partial(change_yaml, tmp_path / "served.yaml")
 
 
-def _line(out, what):
-    return next(line for line in out.splitlines() if f"  {what}  " in f"  {line}")
+def _line(out, topic):
+    return next(line for line in out.splitlines() if f"  {topic}  " in f"  {line}")
 
 
 def test_wrong_devices_are_told_with_what_is_there(acquire, changed):

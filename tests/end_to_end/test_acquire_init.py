@@ -33,9 +33,9 @@ def test_what_was_found_is_in_the_file_and_the_file_loads(tmp_path):
 def test_a_camera_of_the_network_is_found_and_nothing_is_replaced(small_rig, acquire, tmp_path):
     out = tmp_path / "new.yaml"
     with open_rig(load_rig(small_rig())):
-        code, told, err = acquire("init", "--out", out)
+        code, report, err = acquire("init", "--out", out)
     assert code == 0, err
-    assert "1 camera(s)" in told
+    assert "1 camera(s)" in report
     assert load_rig(out).camera.device == "SIM-1"
     text = out.read_text()
     assert acquire("init", "--out", out)[0] == 2

@@ -189,13 +189,13 @@ def test_the_maker_s_own_table_allows_one_phase(stokes, settings: dict[str, obje
 
 def test_an_instrument_that_names_the_analyzers_otherwise_than_the_camera_is_refused(stokes) -> None:
     region = {"width": 40, "height": 24, "pixel_format": f"{ANGLES}Mono8"}
-    other = '[["0", "45"], ["135", "90"]]'
-    code, err, _ = stokes(MONO, region, "--dry-run", mosaic=other)
+    swapped = '[["0", "45"], ["135", "90"]]'
+    code, err, _ = stokes(MONO, region, "--dry-run", mosaic=swapped)
     assert code != 0
     assert "makes super-pixels of 90 45 / 135 0; the instrument file has 0 45 / 135 90" in err
     assert "Write `mosaic: [['90', '45'], ['135', '0']]`" in err
     # A raw mosaic is whatever the instrument file says.
-    code, err, _ = stokes(MONO, region | {"pixel_format": "PolarizeMono8"}, "--dry-run", mosaic=other)
+    code, err, _ = stokes(MONO, region | {"pixel_format": "PolarizeMono8"}, "--dry-run", mosaic=swapped)
     assert code == 0, err
 
 

@@ -15,13 +15,13 @@ NEXT_COLOUR = FIRST.with_changes(wavelength_nm=451)
 
 
 def test_only_changes_are_asked_for():
-    told = []
-    operator = Operator(told.append, StopRequest(), yes=True, simulated=False)
+    questions = []
+    operator = Operator(questions.append, StopRequest(), yes=True, simulated=False)
     assert len(operator.prepare(FIRST, source_selects=False)) == 3
     assert operator.prepare(NEXT_ANGLE, source_selects=False) == []
     (change,) = operator.prepare(NEXT_COLOUR, source_selects=False)
     assert "451" in change
-    assert "451" in told[-1]
+    assert "451" in questions[-1]
 
 
 def test_a_source_that_selects_its_wavelength_is_not_asked_for():

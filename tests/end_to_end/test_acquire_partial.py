@@ -60,7 +60,7 @@ def rig_of(name, small_rig, configs):
 
 @pytest.mark.parametrize("name", INSTRUMENTS)
 def test_from_plan_to_product(name, acquire, small_rig, configs, tmp_path):
-    states, wanted = INSTRUMENTS[name]
+    states, rank = INSTRUMENTS[name]
     rig = rig_of(name, small_rig, configs)
     plan = tmp_path / "plan.yaml"
     plan.write_text(PLAN.format(name=name, states=states))
@@ -71,15 +71,15 @@ def test_from_plan_to_product(name, acquire, small_rig, configs, tmp_path):
         process(["reduce", str(capture), "--out", str(tmp_path / "m.h5"), "--no-figure"])
     assert not end.value.code
     image = MuellerImage.load(tmp_path / "m.h5")
-    assert image.facts["rank"] == wanted
-    seen = np.isfinite(image.values).any(axis=(2, 3)).reshape(16)
-    assert seen.sum() == wanted
+    assert image.facts["rank"] == rank
+    is_determined = np.isfinite(image.values).any(axis=(2, 3)).reshape(16)
+    assert is_determined.sum() == rank
     lit = image.values[0, 0] > 30 * image.errors[0, 0]
     # At the outline the four polarizers of a super-pixel look at different things.
     lit = ndimage.binary_erosion(lit)
     assert lit.mean() > 0.1
     # Nothing passive sends on more polarized light than light: no element exceeds m00 by more than five errors.
-    values, errors = (plane.reshape(16, *lit.shape)[seen][:, lit] for plane in (image.values, image.errors))
+    values, errors = (plane.reshape(16, *lit.shape)[is_determined][:, lit] for plane in (image.values, image.errors))
     assert (np.abs(values) <= values[0] + 5 * errors).mean() > 0.999
     # And some light is polarized: an analysis that saw nothing would report zeros.
     assert np.abs(values[1:] / values[0]).max(axis=0).mean() > 0.01

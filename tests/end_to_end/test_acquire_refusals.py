@@ -45,8 +45,8 @@ def refused(acquire, tmp_path):
 )
 def test_what_is_wrong_in_a_rig_file_is_told_in_a_line(refused, small_rig, change, code, words):
     rig = change_yaml(small_rig(), change)
-    found, err = refused("--omega", 35, "--rig", rig)
-    assert found == code
+    exit_code, err = refused("--omega", 35, "--rig", rig)
+    assert exit_code == code
     assert all(word.format(folder=rig.parent.parent) in err for word in words), err
     assert max(map(len, err.splitlines())) < 700
 

@@ -22,7 +22,7 @@ PLAN = "kind: plan\nstates: {kind: rotating_retarders, states: 16, step_deg: 9, 
 def _kinds() -> list[str]:
     """Kinds of motion controllers, as `simulate serve` finds them."""
     entries = {kind: axis_configs(make(ServeOptions()), "none") for kind, make in served_kinds().items()}
-    return [kind for kind, found in entries.items() if found and found[0].unit == "deg"]
+    return [kind for kind, configs in entries.items() if configs and configs[0].unit == "deg"]
 
 
 class RigMaker:
@@ -58,9 +58,9 @@ class RigMaker:
             "limits_deg": list(limits),
         }
         for index, (name, entry) in enumerate(zip(names, entries, strict=True)):
-            given = entry.model_dump(exclude_defaults=True) | {"kind": entry.kind, "port": f"sim:{port}"}
+            settings = entry.model_dump(exclude_defaults=True) | {"kind": entry.kind, "port": f"sim:{port}"}
             quick = {"poll_s": 0.005, "pause_before_move_s": 0.01}
-            self.axes[name] = given | {key: value for key, value in quick.items() if key in type(entry).model_fields}
+            self.axes[name] = settings | {key: value for key, value in quick.items() if key in type(entry).model_fields}
             self.simulator["axes"][name] = {"port": port, "index": index}
 
     def write(self, source: dict | None) -> Path:

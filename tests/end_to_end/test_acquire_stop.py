@@ -37,8 +37,8 @@ def _program(*arguments):
         process.communicate()
 
 
-def _wait_until(what, process):
-    while not what():
+def _wait_until(condition, process):
+    while not condition():
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)
 
@@ -70,20 +70,22 @@ def test_a_running_capture_is_stopped_and_kept(acquire, served, tmp_path):
 def test_another_program_is_named_and_left_alone(acquire, served):
     _, rig = served
     port = load_rig(rig).axes["psg"].port
-    with _program("-c", f"import time; f = open('{port}', 'rb'); print('open', flush=True); time.sleep(3600)") as other:
-        assert other.stdout.readline() == "open\n"
+    with _program(
+        "-c", f"import time; f = open('{port}', 'rb'); print('open', flush=True); time.sleep(3600)"
+    ) as program:
+        assert program.stdout.readline() == "open\n"
         code, out, _ = acquire("stop", "--rig", rig)
         assert code == 1
-        assert f"(pid {other.pid}) holds a port of this rig; it is not acquire and gets no signal" in out
+        assert f"(pid {program.pid}) holds a port of this rig; it is not acquire and gets no signal" in out
         assert "psg: NOT STOPPED" in out
         # The other line is stopped all the same.
         assert "arm: stop sent, at rest" in out
-        assert other.poll() is None
+        assert program.poll() is None
         code, out, _ = acquire("doctor", "--frames", 1, "--rig", rig)
         assert code == 1
         busy = next(line for line in out.splitlines() if "axis psg" in line)
         assert busy.startswith("BAD")
-        assert f"(pid {other.pid})" in busy
+        assert f"(pid {program.pid})" in busy
 
 
 def test_a_move_that_nobody_waits_for_is_stopped_where_it_can_be(acquire, small_rig, tmp_path):

@@ -25,8 +25,8 @@ def lab(synthetic_capture, configs, tmp_path) -> Path:
     psg = np.arange(STATES) * 7.5
     for seed, name in enumerate(("one_2", "one_10", "deeper/other")):
         frames = np.random.default_rng(seed).integers(400, 3000, (STATES, 1, *SHAPE), dtype=np.uint16)
-        made = synthetic_capture(frames, {"psg": psg, "psa": psg * 4.91}, instrument_yaml=text, detector=detector)
-        made.rename(folder / f"{name}.h5")
+        capture = synthetic_capture(frames, {"psg": psg, "psa": psg * 4.91}, instrument_yaml=text, detector=detector)
+        capture.rename(folder / f"{name}.h5")
     return folder
 
 
@@ -43,8 +43,8 @@ def process(process):
 
 def results(lines: list[str]) -> list[tuple[str, str]]:
     """Result and file name of the lines of a batch."""
-    found = (re.match(r"(made|unchanged|failed) +(\S+)", line) for line in lines)
-    return [(line[1], Path(line[2]).name) for line in found if line]
+    matches = (re.match(r"(made|unchanged|failed) +(\S+)", line) for line in lines)
+    return [(line[1], Path(line[2]).name) for line in matches if line]
 
 
 @pytest.mark.parametrize(
@@ -78,8 +78,8 @@ def test_a_failed_file_is_reported_and_the_rest_is_done(lab, process):
     assert code == 2
     assert {name for _, name in results(out)} == {f"{stem}.mueller.h5" for stem in ("one_2", "one_10", "other")}
     assert out[-1] == "5 inputs: 3 made, 0 unchanged, 2 failed"
-    told = err[err.index("failed:") + 1 :]
-    assert [Path(line.split()[0].rstrip(":")).name for line in told] == ["one_3.h5", "none.h5"]
+    failures = err[err.index("failed:") + 1 :]
+    assert [Path(line.split()[0].rstrip(":")).name for line in failures] == ["one_3.h5", "none.h5"]
     (lab / "one_3.h5").unlink()
     code, out, _ = process("reduce", lab, "--no-figure")
     assert (code, out[-1]) == (0, "3 inputs: 0 made, 3 unchanged, 0 failed")

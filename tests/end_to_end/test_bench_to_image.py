@@ -18,9 +18,9 @@ from simulators.bench.scene import Scene
 
 
 def taken(out: str) -> Path:
-    found = re.search(r"^capture\s+(\S+)$", out, re.MULTILINE)
-    assert found is not None, out
-    return Path(found[1])
+    match = re.search(r"^capture\s+(\S+)$", out, re.MULTILINE)
+    assert match is not None, out
+    return Path(match[1])
 
 
 def process(*args: object) -> None:
@@ -46,9 +46,9 @@ def test_mueller_image_and_xi0_agree_with_the_scene(acquire, small_rig, configs:
     scene = Scene.load(configs / "scenes/red_sphere.yaml")
     truth = scene.truth(35, 662, rows, columns)
     expected = scene.mueller_image(35, 662, rows, columns)[truth.mask].astype(float)
-    found = image.matrices[truth.mask]
+    matrices = image.matrices[truth.mask]
     errors = np.moveaxis(image.errors, (0, 1), (-2, -1))[truth.mask]
-    pulls = (found - scaled(found, expected)) / errors
+    pulls = (matrices - scaled(matrices, expected)) / errors
     assert np.mean(pulls**2) == pytest.approx(1.0, abs=0.03)
     process("xi0", capture, "--no-figure")
     with Product(capture.with_suffix(".xi0.h5")) as product:
@@ -106,8 +106,8 @@ def test_known_samples(sample: str, omega: int, expected: np.ndarray, acquire, s
     process("reduce", capture, "--no-figure")
     image = MuellerImage.load(capture.with_suffix(".mueller.h5"))
     good = image.mask == 0
-    found, errors = image.matrices[good], np.moveaxis(image.errors, (0, 1), (-2, -1))[good]
-    pulls = (found - scaled(found, np.broadcast_to(expected, found.shape))) / errors
+    matrices, errors = image.matrices[good], np.moveaxis(image.errors, (0, 1), (-2, -1))[good]
+    pulls = (matrices - scaled(matrices, np.broadcast_to(expected, matrices.shape))) / errors
     assert np.mean(pulls**2) == pytest.approx(1.0, abs=0.03)
-    mean = found.mean(axis=0) / found[:, 0, 0].mean()
+    mean = matrices.mean(axis=0) / matrices[:, 0, 0].mean()
     assert np.max(np.abs(mean - expected)) < 0.003

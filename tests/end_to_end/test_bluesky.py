@@ -185,14 +185,14 @@ def test_tiled_reads_back_what_it_was_told(bench, engine, tiled, tmp_path):
         _assert_same(stream[f"capture_{name}"].read()[0], values)
 
     # The same server, for it takes seconds to start: a scan of the camera alone.
-    camera, taken = bench.camera, []
+    camera, pictures = bench.camera, []
     camera.folder = tmp_path / "frames"
-    run.subscribe(lambda *_: taken.append(camera._frame.copy()), "event")
+    run.subscribe(lambda *_: pictures.append(camera._frame.copy()), "event")
     (uid,) = run(scan([camera], bench.axes["psg"], 10, 40, 4))
     stream = tiled[uid]["primary"]
-    _assert_same(stream["camera_frame"].read(), np.stack(taken))
-    _assert_same(stream["camera_mean"].read(), np.array([frame.mean() for frame in taken]))
-    assert not np.array_equal(taken[0], taken[2])
+    _assert_same(stream["camera_frame"].read(), np.stack(pictures))
+    _assert_same(stream["camera_mean"].read(), np.array([frame.mean() for frame in pictures]))
+    assert not np.array_equal(pictures[0], pictures[2])
 
 
 def _assert_same(read, written) -> None:
@@ -227,8 +227,8 @@ def _paused(run, device, folder) -> None:
 def _omegas(documents):
     for event in _events(documents):
         with Capture(event["capture_file"]) as capture:
-            told = {float(deg) for deg in np.round(capture.angles_deg["arm"], 2)}
-            yield round(event["arm"], 2), capture.header.omega_deg, told
+            angles = {float(deg) for deg in np.round(capture.angles_deg["arm"], 2)}
+            yield round(event["arm"], 2), capture.header.omega_deg, angles
 
 
 @pytest.mark.long

@@ -53,7 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, configs: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def here(folder: Path, configs: Path, tmp_path_factory: pytest.TempPathFactory) -> CampaignResult:
+def serial(folder: Path, configs: Path, tmp_path_factory: pytest.TempPathFactory) -> CampaignResult:
     """The campaign worked out in this process."""
     files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
     with executor(1) as pool:
@@ -127,8 +127,8 @@ def test_without_a_geometry_every_capture_has_its_means(folder, configs, process
 
 
 def test_a_damaged_capture_is_reported_and_the_rest_is_made(configs, process, tmp_path):
-    whole = small(tmp_path, configs, "whole", 20)
-    content = whole.read_bytes()
+    sound = small(tmp_path, configs, "whole", 20)
+    content = sound.read_bytes()
     (tmp_path / "torn.h5").write_bytes(content[: len(content) // 2])
     with h5py.File(tmp_path / "foreign.h5", "w") as h5:
         h5["mesh"] = [1.0, 2.0]
@@ -195,24 +195,24 @@ def test_the_campaigns_own_air_corrects_its_instrument(configs, process, tmp_pat
     assert (code, "no capture of air for --correct. Take one:" in err) == (2, True)
 
 
-def test_tables_compared_by_hand_give_the_campaigns_number(here, configs, process, tmp_path):
-    tables = [here.tables[kind, 662.0] for kind in ("mueller", "stokes")]
-    rest = ["--geometry", configs / "geometries/one_inch_sphere.yaml", "--figure", tmp_path / "f.png"]
-    code, out, err = process("compare-tables", *tables, *rest, "--omega", "35,60", "--size", 180)
+def test_tables_compared_by_hand_give_the_campaigns_number(serial, configs, process, tmp_path):
+    tables = [serial.tables[kind, 662.0] for kind in ("mueller", "stokes")]
+    options = ["--geometry", configs / "geometries/one_inch_sphere.yaml", "--figure", tmp_path / "f.png"]
+    code, out, err = process("compare-tables", *tables, *options, "--omega", "35,60", "--size", 180)
     assert code == 0, err
-    for row in here.rows:
+    for row in serial.rows:
         line = next(text for text in out.splitlines() if text.strip().startswith(f"{row.omega_deg:g} "))
         assert [float(v) for v in line.split()[1:]] == pytest.approx(
             [row.xi0_percent, row.xi0_noise_percent, row.xi0_systematic_percent, row.common], abs=6e-4
         )
     assert (tmp_path / "f.png").stat().st_size > 10_000
-    code, _, err = process("compare-tables", *tables, *rest, "--omega", "x")
+    code, _, err = process("compare-tables", *tables, *options, "--omega", "x")
     assert (code, "give numbers in degrees" in err) == (2, True)
 
 
 @pytest.mark.long
-def test_report_of_a_campaign_shows_its_tables_and_eigenvalues(folder, here, process, tmp_path):
-    results = here.tables["mueller", 662.0].parent
+def test_report_of_a_campaign_shows_its_tables_and_eigenvalues(folder, serial, process, tmp_path):
+    results = serial.tables["mueller", 662.0].parent
     code, _, err = process("report", results, "--out", tmp_path / "r.html")
     assert code == 0, err
     text = (tmp_path / "r.html").read_text()
@@ -220,22 +220,22 @@ def test_report_of_a_campaign_shows_its_tables_and_eigenvalues(folder, here, pro
     assert "coherency eigenvalues, xi0 and its error" in text
 
 
-def test_noise_of_psi_and_magnitude_explains_no_more_than_there_is(here):
-    for row in here.rows:
+def test_noise_of_psi_and_magnitude_explains_no_more_than_there_is(serial):
+    for row in serial.rows:
         assert 0 < row.psi_noise_deg < 1.1 * row.psi_deg
         assert 0 < row.magnitude_noise_percent < 1.1 * row.magnitude_percent
 
 
 @SLOW_DISC
-def test_a_cluster_gives_the_same_numbers(folder, here, configs, tmp_path):
+def test_a_cluster_gives_the_same_numbers(folder, serial, configs, tmp_path):
     distributed = pytest.importorskip("distributed")
     files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
     # One address on loopback and no dashboard: both would look for a network.
     settings = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
     settings |= {"protocol": "tcp", "host": "127.0.0.1"}
     with distributed.LocalCluster(**settings) as cluster, executor(scheduler=cluster.scheduler_address) as pool:
-        there = ProcessedCampaign(folder, tmp_path, *files).run(pool)
-    assert here.rows == there.rows
+        in_cluster = ProcessedCampaign(folder, tmp_path, *files).run(pool)
+    assert serial.rows == in_cluster.rows
 
 
 @SLOW_DISC
@@ -266,8 +266,8 @@ def test_a_cluster_survives_a_capture_that_fails_and_a_worker_that_dies(configs,
         killer.start()
         code, out, err = process("campaign", tmp_path, "--scheduler", cluster.scheduler_address)
         killer.join()
-        made = {path: path.stat().st_mtime_ns for path in (tmp_path / "campaign").glob("*.mueller.h5")}
-        assert (code, len(made), killed != []) == (1, 4, True), err
+        stamps = {path: path.stat().st_mtime_ns for path in (tmp_path / "campaign").glob("*.mueller.h5")}
+        assert (code, len(stamps), killed != []) == (1, 4, True), err
         assert [line for line in err.splitlines() if line.startswith("  ") and "c2.h5" in line], err
         assert "1 capture failed. The same command makes only what is missing." in err
         assert len({row["capture"] for row in read(tmp_path / "campaign/means.csv")}) == 4
@@ -277,7 +277,7 @@ def test_a_cluster_survives_a_capture_that_fails_and_a_worker_that_dies(configs,
     assert code == 0, err
     again = [line.split()[1] for line in out.splitlines() if line.startswith("made")]
     assert again == [str(tmp_path / "campaign/c2.mueller.h5")]
-    assert all(path.stat().st_mtime_ns == stamp for path, stamp in made.items())
+    assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
 
 
 def test_no_scheduler_is_a_message(folder, configs, process, monkeypatch):
@@ -294,8 +294,8 @@ def test_registering_finds_a_sphere_that_the_geometry_file_misses(folder, config
     material = configs / "materials/red_print.yaml"
     with executor(1) as pool:
         off = ProcessedCampaign(folder, tmp_path / "a", wrong, material).run(pool)
-        found = ProcessedCampaign(folder, tmp_path / "b", wrong, material, register=True).run(pool)
-    for worse, better in zip(off.rows, found.rows, strict=True):
+        registered = ProcessedCampaign(folder, tmp_path / "b", wrong, material, register=True).run(pool)
+    for worse, better in zip(off.rows, registered.rows, strict=True):
         assert better.psi_deg < 0.6 * worse.psi_deg
     product = next((tmp_path / "a").glob("drr_60.mueller.h5"))
     code, out, err = process("register", product, "--geometry", wrong, "--out", tmp_path / "right.yaml")
@@ -333,8 +333,8 @@ def test_tables_and_material_and_extrapolation(folder, configs, process, tmp_pat
         assert fitted.n == pytest.approx(1.3, abs=0.03)
         assert fitted.a == pytest.approx(0.17, abs=0.02)
         assert fitted.b == pytest.approx(2.0, abs=0.1)
-    for given, out, message in ((stokes, target, "exists"), (products, tmp_path / "both.yaml", "kinds")):
-        code, _, err = process("fit-material", *given, "--geometry", geometry, "--out", out)
+    for files, out, message in ((stokes, target, "exists"), (products, tmp_path / "both.yaml", "kinds")):
+        code, _, err = process("fit-material", *files, "--geometry", geometry, "--out", out)
         assert code == 2
         assert message in err
 
@@ -409,11 +409,11 @@ def test_of_two_modes_or_samples_at_one_angle_the_user_chooses(folder, configs, 
     assert (code, "of the samples white_sphere and red_sphere" in err) == (2, True), err
     code, _, err = process("campaign", tmp_path, *files, "--mode", "mosaic")
     assert (code, "no capture is of the mode 'mosaic'; there are: drr, drr_fine, stokes" in err) == (2, True), err
-    wanted = ("--mode", "drr", "--mode", "stokes", "--sample", "red_sphere")
-    code, _, err = process("campaign", tmp_path, *files, *wanted)
+    choice = ("--mode", "drr", "--mode", "stokes", "--sample", "red_sphere")
+    code, _, err = process("campaign", tmp_path, *files, *choice)
     assert code == 0, err
     assert "fine_35.h5: mode drr_fine, sample red_sphere; not asked for" in err
     assert "other_35.h5: mode stokes, sample white_sphere; not asked for" in err
-    made = {path.name for path in (tmp_path / "campaign").glob("*.h5")}
-    assert {"drr_35.mueller.h5", "stokes_35.stokes.h5"} <= made
-    assert not any(name.startswith(("fine", "other")) for name in made)
+    products = {path.name for path in (tmp_path / "campaign").glob("*.h5")}
+    assert {"drr_35.mueller.h5", "stokes_35.stokes.h5"} <= products
+    assert not any(name.startswith(("fine", "other")) for name in products)

@@ -68,12 +68,12 @@ def test_a_wrong_option_is_told_as_every_mistake(name, words, message, capsys):
     with pytest.raises(SystemExit) as end:
         COMMANDS[name](words.split())
     assert end.value.code == 2
-    said = capsys.readouterr()
-    assert not said.out
-    assert said.err.startswith("error: ")
-    assert message in said.err
-    assert "-h tells more" in said.err
-    assert "Input should" not in said.err
+    streams = capsys.readouterr()
+    assert not streams.out
+    assert streams.err.startswith("error: ")
+    assert message in streams.err
+    assert "-h tells more" in streams.err
+    assert "Input should" not in streams.err
 
 
 def test_ctrl_c_is_answered(capfd):
@@ -94,11 +94,11 @@ def test_ctrl_c_is_answered(capfd):
 def test_umov_has_every_command(name, capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["umov"])
     monkeypatch.setenv("UMOV_DOOR", "")
-    for words, said in (([name, "-h"], f"umov {name} [OPTIONS]"), ([name, "--version"], f"umov {version('umov')}")):
+    for words, answer in (([name, "-h"], f"umov {name} [OPTIONS]"), ([name, "--version"], f"umov {version('umov')}")):
         with pytest.raises(SystemExit) as end:
             umov(words)
         assert not end.value.code
-        assert said in capsys.readouterr().out
+        assert answer in capsys.readouterr().out
 
 
 def test_umov_needs_no_process_before_a_command_of_it(capsys, monkeypatch):
@@ -115,5 +115,5 @@ def test_umov_lists_its_commands(capsys):
         with pytest.raises(SystemExit) as end:
             umov(words)
         assert end.value.code == code
-        said = capsys.readouterr()
-        assert all(name in said.out + said.err for name in COMMANDS)
+        streams = capsys.readouterr()
+        assert all(name in streams.out + streams.err for name in COMMANDS)

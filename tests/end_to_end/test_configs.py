@@ -69,9 +69,9 @@ def test_campaign_loads_round_trips_and_fits_the_simulated_rig(path):
 
 def test_red_sphere_campaign_is_what_the_issue_asks_for():
     campaign = Campaign.load(CONFIGS / "campaigns" / "red_sphere.yaml")
-    taken = [capture for capture in captures(campaign) if not capture.reference]
-    assert len(taken) == 2 * 2 * 15
-    assert [capture.plan.omega_deg for capture in taken[:15]] == [20 + 5 * k for k in range(15)]
+    planned = [capture for capture in captures(campaign) if not capture.reference]
+    assert len(planned) == 2 * 2 * 15
+    assert [capture.plan.omega_deg for capture in planned[:15]] == [20 + 5 * k for k in range(15)]
     references = [capture for capture in captures(campaign) if capture.reference]
     flats = [capture for capture in references if capture.plan.role == "flat"]
     assert {capture.plan.mode for capture in flats} == {"drr", "stokes"}
@@ -80,5 +80,5 @@ def test_red_sphere_campaign_is_what_the_issue_asks_for():
     # Before the first and after the eighth of fifteen, for each wavelength.
     assert (len(airs), len(flats)) == (4, 8)
     # What needs a person changes once.
-    wavelengths = [capture.plan.wavelength_nm for capture in taken]
+    wavelengths = [capture.plan.wavelength_nm for capture in planned]
     assert sum(a != b for a, b in itertools.pairwise(wavelengths)) == 1

@@ -42,11 +42,11 @@ def test_the_loop_is_closed(acquire, configs, tmp_path, seed):
     assert set(load_rig(folder / "rig.yaml").simulator.effects) >= {fault.effect for fault in drawn}
     # Nothing is sure that is not there, and, last of all, the Mueller matrix is not worse.
     assert not re.search(r"built in  nothing\n.*\(sure\)", after)
-    made = cv2.imread(str(folder / "demo.png")).astype(int)
+    picture = cv2.imread(str(folder / "demo.png")).astype(int)
     if seed == PICTURED:
         shown = cv2.imread(str(configs.parent / "docs/images/demo.png")).astype(int)
         # Fonts differ a little from one version of the drawing library to the next, curves and maps do not.
-        assert np.abs(made - shown).mean() < 1
+        assert np.abs(picture - shown).mean() < 1
     assert (folder / "corrected.yaml").exists()
     assert (folder / "report.html").exists()
     first, last = (float(text) for text in re.search(r"error of M/m00 +(\S+) +(\S+)", after).groups())
@@ -54,8 +54,8 @@ def test_the_loop_is_closed(acquire, configs, tmp_path, seed):
 
 
 def test_same_seed_same_faults():
-    first, again, other = (draw_faults(seed, 2, (), 44) for seed in (5, 5, 6))
-    assert first == again != other
+    first, again, different = (draw_faults(seed, 2, (), 44) for seed in (5, 5, 6))
+    assert first == again != different
 
 
 @pytest.mark.parametrize("kind", drawable())

@@ -32,41 +32,41 @@ def diagnosed(acquire, small_rig, configs, tmp_path):
 
 @pytest.mark.long
 def test_a_rig_as_described_is_consistent(diagnosed, configs, tmp_path, capfd):
-    said = diagnosed([])
-    assert said["verdict"] == "consistent"
-    assert said["error_before"]["chi2_reduced"] == pytest.approx(1, abs=0.03)
-    assert said["captures"][0]["dark_fraction"] > 0.3
+    report = diagnosed([])
+    assert report["verdict"] == "consistent"
+    assert report["error_before"]["chi2_reduced"] == pytest.approx(1, abs=0.03)
+    assert report["captures"][0]["dark_fraction"] > 0.3
     # Nothing is corrected, and by how much M may be off all the same is told, and written for its error bars.
-    assert said["error_after"] == said["error_before"]
-    told = capfd.readouterr()
-    assert "nothing is corrected" in told.out
-    assert "grows" not in told.out
-    assert re.search(r"M/m00 may still be off by [\d.e-]+ \(rms of its elements\), most in M(?!00)\d\d by", told.out)
+    assert report["error_after"] == report["error_before"]
+    streams = capfd.readouterr()
+    assert "nothing is corrected" in streams.out
+    assert "grows" not in streams.out
+    assert re.search(r"M/m00 may still be off by [\d.e-]+ \(rms of its elements\), most in M(?!00)\d\d by", streams.out)
     declared, new = (InstrumentModel.load(f) for f in (configs / "instruments/rgb950.yaml", tmp_path / "new.yaml"))
     # A capture holds its instrument at its own wavelength.
     assert new.model_copy(update={"systematic": ()}) == declared.at(662)
-    assert new.systematic[0].rms_over_m00 == pytest.approx(said["correction"]["mueller"]["rms"])
+    assert new.systematic[0].rms_over_m00 == pytest.approx(report["correction"]["mueller"]["rms"])
     assert "nothing is corrected" in (tmp_path / "new.yaml").read_text().splitlines()[0]
 
 
 @pytest.mark.long
 def test_an_undeclared_fault_is_found(diagnosed):
-    said = diagnosed([{"kind": "angle_offset", "axis": "psg", "offset_deg": 0.5}])
-    assert said["verdict"] == "explained"
-    (effect,) = said["effects"]
+    report = diagnosed([{"kind": "angle_offset", "axis": "psg", "offset_deg": 0.5}])
+    assert report["verdict"] == "explained"
+    (effect,) = report["effects"]
     assert effect["kind"] == "psg_azimuth"
-    found = effect["parameters"]["azimuth"]
-    assert found["value"] == pytest.approx(0.5, abs=3 * found["stderr"])
+    azimuth = effect["parameters"]["azimuth"]
+    assert azimuth["value"] == pytest.approx(0.5, abs=3 * azimuth["stderr"])
 
 
 @pytest.mark.long
 def test_a_residual_below_the_noise_says_what_is_explained(diagnosed, capfd):
     """A slip that is seen beyond doubt leaves the rms of single pixels under its bound, before and after."""
     (effect,) = diagnosed([{"kind": "angle_slip", "axis": "psa", "at_index": 13, "slip_deg": 0.8}])["effects"]
-    said = capfd.readouterr().out
+    text = capfd.readouterr().out
     slip = effect["parameters"]["slip"]
     value, error = map(
-        float, re.search(r"beyond noise under [\d.]+ % \(([\d.]+) ± ([\d.]+) % explained\)", said).groups()
+        float, re.search(r"beyond noise under [\d.]+ % \(([\d.]+) ± ([\d.]+) % explained\)", text).groups()
     )
     # The explained part is as many of its errors from zero as the slip.
     assert value / error == pytest.approx(abs(slip["value"]) / slip["stderr"], rel=0.2)

@@ -66,12 +66,20 @@ def test_first_surface_lacks_polarized_diffuse(name, configs, scene, tmp_path, c
     plain, new = tmp_path / "plain.yaml", tmp_path / "new.yaml"
     plain.write_text(FIRST_SURFACE)
     geometry = configs / "geometries/one_inch_sphere.yaml"
-    given = [path, "--instrument", configs / f"instruments/{name}.yaml", "--reflectance", plain, "--geometry", geometry]
-    given += ["--write", new, "--json", tmp_path / "d.json", "--report", tmp_path / "d.html"]
-    assert run(diagnose, *given) == 0
-    said = capsys.readouterr().out
-    assert "SIMULATED" in said
-    assert "polarized_diffuse" in said
+    command = [
+        path,
+        "--instrument",
+        configs / f"instruments/{name}.yaml",
+        "--reflectance",
+        plain,
+        "--geometry",
+        geometry,
+    ]
+    command += ["--write", new, "--json", tmp_path / "d.json", "--report", tmp_path / "d.html"]
+    assert run(diagnose, *command) == 0
+    text = capsys.readouterr().out
+    assert "SIMULATED" in text
+    assert "polarized_diffuse" in text
     d = SurfaceDiagnosis.model_validate(json.loads((tmp_path / "d.json").read_text()))
     assert d.verdict == "explained"
     (effect,) = d.effects
@@ -83,18 +91,18 @@ def test_first_surface_lacks_polarized_diffuse(name, configs, scene, tmp_path, c
     assert "chance that the error of xi0 grows" in report
 
     # xi0 of the Stokes camera: only the new material is right.
-    found = []
+    errors = []
     for material, out in ((plain, tmp_path / "before.h5"), (new, tmp_path / "after.h5")):
         options = ("--geometry", geometry, "--material", material, "--no-figure")
         assert run(process, "xi0", stokes, *options, "--out", out) == 0
-        found.append((*errors_of_m0(scene, material), error_of_xi0(scene, out)))
-    (psi, size, xi0), (psi_after, size_after, xi0_after) = found
+        errors.append((*errors_of_m0(scene, material), error_of_xi0(scene, out)))
+    (psi, size, xi0), (psi_after, size_after, xi0_after) = errors
     assert (psi, size) == pytest.approx((41, 28), abs=6)
     assert psi_after < 1.0
     assert size_after < 1.0
     assert xi0_after < 0.3 * xi0
 
-    assert run(diagnose, *given) == 2
+    assert run(diagnose, *command) == 2
     assert "exists and is not replaced" in capsys.readouterr().err
 
 
@@ -105,16 +113,16 @@ def test_what_acquire_writes_in_stokes_mode_is_enough(acquire, small_rig, config
     (path,) = tmp_path.glob("*.h5")
     plain, out = tmp_path / "plain.yaml", tmp_path / "d.json"
     plain.write_text(FIRST_SURFACE)
-    given = ["--reflectance", plain, "--geometry", configs / "geometries/one_inch_sphere.yaml"]
+    options = ["--reflectance", plain, "--geometry", configs / "geometries/one_inch_sphere.yaml"]
     stokes, mueller = (configs / f"instruments/{name}.yaml" for name in ("linear_stokes", "rgb950"))
-    assert run(diagnose, path, "--instrument", stokes, *given, "--json", out) == 0
+    assert run(diagnose, path, "--instrument", stokes, *options, "--json", out) == 0
     d = SurfaceDiagnosis.model_validate(json.loads(out.read_text()))
     assert (d.verdict, [e.kind for e in d.effects]) == ("explained", ["polarized_diffuse"])
     assert d.effects[0].parameters["a"].value == pytest.approx(0.17, abs=3.5 * d.effects[0].parameters["a"].stderr)
     # First surface alone does not know the normal; with what was found a sphere off its place would show.
     assert "registration[sphere]" not in d.unobservable
     capfd.readouterr()
-    assert run(diagnose, path, "--instrument", mueller, *given) == 2
+    assert run(diagnose, path, "--instrument", mueller, *options) == 2
     assert "Use the instrument file that belongs to the capture" in capfd.readouterr().err
 
 
@@ -127,8 +135,8 @@ def test_geometry_and_instrument_that_were_found_end_the_error(configs, scene, t
     take(path, fault, declared, NM, omega_deg=OMEGA_DEG, seed=3)
     material = configs / "materials/red_print.yaml"
     geometry = configs / "geometries/one_inch_sphere.yaml"
-    given = ["--instrument", configs / "instruments/rgb950.yaml", "--reflectance", material, "--geometry", geometry]
-    assert run(diagnose, path, *given, "--write", new) == 0
+    options = ["--instrument", configs / "instruments/rgb950.yaml", "--reflectance", material, "--geometry", geometry]
+    assert run(diagnose, path, *options, "--write", new) == 0
     assert not new.exists()
     corrected = ViewingGeometry.load(tmp_path / "new.geometry.yaml")
     assert corrected.arm_zero_deg == pytest.approx(2.0, abs=0.4)
@@ -138,7 +146,7 @@ def test_geometry_and_instrument_that_were_found_end_the_error(configs, scene, t
         assert opened.header.omega_deg == OMEGA_DEG
     again = diagnose_object([path], instrument, load_reflectance(material), corrected)[0].diagnosis
     assert again.verdict == "consistent"
-    assert run(diagnose, path, *given, "--write", new) == 2
+    assert run(diagnose, path, *options, "--write", new) == 2
 
 
 def test_both_files_are_needed(configs, tmp_path, capsys):

@@ -102,14 +102,14 @@ def shown(block: Block) -> list[list[str]]:
 
 def blocks_of(page: Path) -> list[Block]:
     """Code blocks of a page; one that is made by indentation has no language."""
-    found = []
+    blocks = []
     for token in MarkdownIt().parse(page.read_text(encoding="utf-8")):
         if token.type in ("fence", "code_block"):
-            language, _, rest = token.info.partition(" ")
-            title = re.search(r'title="([^"]+)"', rest)
+            language, _, attributes = token.info.partition(" ")
+            title = re.search(r'title="([^"]+)"', attributes)
             line = token.map[0] + 1 if token.map else 0
-            found.append(Block(page, line, language, title[1] if title else "", token.content))
-    return found
+            blocks.append(Block(page, line, language, title[1] if title else "", token.content))
+    return blocks
 
 
 # The parser logs every rule that it tries, which takes as long as the parsing.
@@ -119,8 +119,8 @@ BLOCKS = [block for page in PAGES for block in blocks_of(page)]
 
 def run_by_ci(block: Block) -> bool:
     """Whether CI's script says the same: the tests do not run themselves."""
-    said = (ROOT / ".ci/run").read_text(encoding="utf-8").splitlines()
-    return all(shlex.join(words) in said for words in block.commands())
+    lines = (ROOT / ".ci/run").read_text(encoding="utf-8").splitlines()
+    return all(shlex.join(words) in lines for words in block.commands())
 
 
 OWN_POLARIMETER = ROOT / "docs/tutorial-your-own-polarimeter.md"
@@ -332,8 +332,8 @@ def require_options(name: str, words: list[str]) -> None:
     if hasattr(command, "commands") and not words[0].startswith("-"):
         assert words[0] in command.commands, f"{name} has no command {words[0]!r}"
         command = command.commands[words[0]]
-    known = {option for parameter in command.params for option in parameter.opts}
-    assert {word for word in words if word.startswith("--")} <= known
+    options = {option for parameter in command.params for option in parameter.opts}
+    assert {word for word in words if word.startswith("--")} <= options
 
 
 @pytest.mark.parametrize("block", [b for b in BLOCKS if b.language == "yaml"], ids=lambda b: f"{b.page.stem}-{b.line}")
@@ -357,18 +357,18 @@ def test_yaml_is_valid_where_it_belongs(block: Block, tmp_path: Path) -> None:
         for folder in ("instruments", "scenes", "plans"):
             (tmp_path / folder).symlink_to(ROOT / "configs" / folder)
         path.parent.mkdir()
-        whole = yaml.load(base)
-        merge(whole, part)
-        part = whole
+        document = yaml.load(base)
+        merge(document, part)
+        part = document
     with path.open("w") as file:
         yaml.dump(part, file)
     load(path)
 
 
-def merge(whole: dict, part: dict) -> None:
+def merge(document: dict, part: dict) -> None:
     """Put a part of a file into it; sections are merged, lists and values replaced."""
     for key, value in part.items():
-        if isinstance(value, dict) and isinstance(whole.get(key), dict):
-            merge(whole[key], value)
+        if isinstance(value, dict) and isinstance(document.get(key), dict):
+            merge(document[key], value)
         else:
-            whole[key] = value
+            document[key] = value

@@ -20,10 +20,10 @@ def test_a_picture_shows_the_residual_of_its_fault(kind):
     shown = cv2.imread(str(effects_page.PICTURES / f"{kind}.png")).astype(int)
     out = BytesIO()
     effects_page.picture(FAULTS[kind]).savefig(out, format="png", dpi=100)
-    made = cv2.imdecode(np.frombuffer(out.getvalue(), np.uint8), cv2.IMREAD_COLOR).astype(int)
-    assert made.shape == shown.shape
+    picture = cv2.imdecode(np.frombuffer(out.getvalue(), np.uint8), cv2.IMREAD_COLOR).astype(int)
+    assert picture.shape == shown.shape
     # Fonts differ a little from one version of the drawing library to the next, curves and maps do not.
-    assert np.abs(made - shown).mean() < 3
+    assert np.abs(picture - shown).mean() < 3
 
 
 def test_no_picture_is_of_an_effect_that_went():

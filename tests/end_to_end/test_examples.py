@@ -37,10 +37,10 @@ def test_script(name, tmp_path, monkeypatch, capsys, small_rig, default_rig):
     # The rig of the examples has 360 000 pixels at a tenth of real time.
     default_rig(small_rig())
     runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
-    said = capsys.readouterr().out
-    assert SAID[name] in said
+    text = capsys.readouterr().out
+    assert SAID[name] in text
     if name == "close_the_loop":
-        before, after = (float(line.split()[-1]) for line in said.splitlines()[-2:])
+        before, after = (float(line.split()[-1]) for line in text.splitlines()[-2:])
         assert after < 0.7 * before
 
 
@@ -53,9 +53,9 @@ def test_notebook(name, capsys, monkeypatch):
     for cell in cells:
         if cell["cell_type"] == "code":
             exec(compile("".join(cell["source"]), f"{name}.ipynb", "exec"), scope)
-            kept = "".join(line for o in cell["outputs"] if o["output_type"] == "stream" for line in o["text"])
-            said = capsys.readouterr().out
+            stored = "".join(line for o in cell["outputs"] if o["output_type"] == "stream" for line in o["text"])
+            text = capsys.readouterr().out
             # The last digits are those of the processor.
-            assert NUMBER.split(said) == NUMBER.split(kept)
-            assert [*map(float, NUMBER.findall(said))] == pytest.approx([*map(float, NUMBER.findall(kept))], rel=0.05)
+            assert NUMBER.split(text) == NUMBER.split(stored)
+            assert [*map(float, NUMBER.findall(text))] == pytest.approx([*map(float, NUMBER.findall(stored))], rel=0.05)
     assert any(cell.get("outputs") for cell in cells)

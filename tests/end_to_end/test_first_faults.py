@@ -77,16 +77,16 @@ def check(case: Case, acquire, rig, configs, folder, capfd) -> None:
     code, _, err = acquire("--omega", case.omega, "--sample", case.sample, "--rig", rig, "--out", folder)
     assert code == 0, err
     (capture,) = folder.glob("*.h5")
-    said, new, again = folder / "said.json", folder / "new.yaml", folder / "again.h5"
+    file, new, again = folder / "said.json", folder / "new.yaml", folder / "again.h5"
     instrument = configs / "instruments/rgb950.yaml"
-    run(diagnose_cli.main, capture, "--instrument", instrument, "--write", new, "--json", said)
+    run(diagnose_cli.main, capture, "--instrument", instrument, "--write", new, "--json", file)
     run(process, "reduce", capture, "--no-figure")
     run(process, "reduce", capture, "--instrument", new, "--out", again, "--no-figure")
-    found = json.loads(said.read_text())
-    names = {(e["kind"], *(n.partition("[")[0] for n in e["indistinguishable_from"])) for e in found["effects"]}
-    sure = {e["kind"] for e in found["effects"] if e["answer"] == "sure" and e["confident"]}
+    report = json.loads(file.read_text())
+    names = {(e["kind"], *(n.partition("[")[0] for n in e["indistinguishable_from"])) for e in report["effects"]}
+    sure = {e["kind"] for e in report["effects"] if e["answer"] == "sure" and e["confident"]}
     assert all(case.right & set(equal) for equal in names if equal[0] in sure)
-    assert bool(found["effects"]) == bool(case.effects)
+    assert bool(report["effects"]) == bool(case.effects)
     errors = []
     scene = Scene.load(configs / "scenes" / f"{case.sample}.yaml")
     for product in (capture.with_suffix(".mueller.h5"), again):
@@ -95,9 +95,9 @@ def check(case: Case, acquire, rig, configs, folder, capfd) -> None:
         errors.append(true_error(product, xi0, scene).mueller_rms)
     with capfd.disabled():
         shown = "; ".join(f"{'/'.join(equal)}{' (sure)' if equal[0] in sure else ''}" for equal in sorted(names))
-        print(f"\n| {found['verdict']} | {shown or 'no name'} | {errors[0]:.5f} to {errors[1]:.5f} |", flush=True)
+        print(f"\n| {report['verdict']} | {shown or 'no name'} | {errors[0]:.5f} to {errors[1]:.5f} |", flush=True)
     assert errors[1] <= 1.01 * errors[0]
-    assert not case.effects or found["correction"]["refused"] is None
+    assert not case.effects or report["correction"]["refused"] is None
 
 
 @SLOW

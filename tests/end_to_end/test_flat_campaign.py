@@ -72,20 +72,20 @@ def m00_of(product: Path) -> np.ndarray:
     return MuellerImage.load(product).values[0, 0]
 
 
-def unevenness(found: np.ndarray, truth: np.ndarray, good: np.ndarray) -> float:
+def unevenness(image: np.ndarray, truth: np.ndarray, good: np.ndarray) -> float:
     """Relative rms deviation of an image from the truth times a number."""
-    ratio = found[good] / truth[good]
+    ratio = image[good] / truth[good]
     return float(np.std(ratio) / np.mean(ratio))
 
 
 def test_references_come_at_the_stated_intervals(campaign):
-    taken = [path.stem.split("_", 1)[1] for path in sorted(campaign.glob("*.h5"))]
-    drr = [name for name in taken if "drr" in name]
+    names = [path.stem.split("_", 1)[1] for path in sorted(campaign.glob("*.h5"))]
+    drr = [name for name in names if "drr" in name]
     assert [name.rsplit("_", 3)[0] for name in drr] == [
         *("air", "white_diffuser", "red_sphere", "red_sphere"),
         *("air", "white_diffuser", "red_sphere"),
     ]
-    assert [name.rsplit("_", 3)[0] for name in taken if "stokes" in name] == [
+    assert [name.rsplit("_", 3)[0] for name in names if "stokes" in name] == [
         *("white_diffuser", "red_sphere", "red_sphere"),
         *("white_diffuser", "red_sphere"),
     ]

@@ -59,10 +59,10 @@ def test_tiffs_and_a_table_with_its_own_columns(configs, tmp_path, process, drr)
         *("--stack", tmp_path / "run", "--darks", f"{tmp_path}/dark/*.tiff", "--wavelength-nm", 532),
         *("--instrument", configs / "instruments" / "drr_5to1.yaml", "--out", out),
     )
-    code, said, _ = process(*command, "--dry-run")
+    code, text, _ = process(*command, "--dry-run")
     assert code == 0
-    assert "41 states, 5 of them dark" in said
-    assert "img_2.tif" in said.splitlines()[4]
+    assert "41 states, 5 of them dark" in text
+    assert "img_2.tif" in text.splitlines()[4]
     assert (tmp_path / "sample.import.png").exists()
     assert not out.exists()
     assert process(*command)[0] == 0
@@ -86,9 +86,9 @@ def test_hdf5_in_radians_with_darks_in_another_dataset(configs, tmp_path, proces
         *("--stack", f"{file}::/scan/frames", "--darks", f"{file}::/darks", "--wavelength-nm", 532, "--out", out),
         *("--instrument", configs / "instruments" / "drr_5to1.yaml"),
     )
-    code, _, said = process(*command)
+    code, _, text = process(*command)
     assert code == 2
-    assert "--angles radians" in said
+    assert "--angles radians" in text
     assert process(*command, "--angles", "radians")[0] == 0
     assert mueller_of(process, out) == pytest.approx(SAMPLE, abs=2e-3)
 
@@ -126,8 +126,8 @@ def test_other_files_of_the_same_scan(configs, tmp_path, process, drr, kind, mon
             cv2.imwrite(f"state_{k}/frame.tif", frames[k])
         options += ["--stack", "state_*/frame.tif"]
     out = tmp_path / "sample.h5"
-    code, _, said = process("import", *options, "--wavelength-nm", 532, "--instrument", instrument, "--out", out)
-    assert code == 0, said
+    code, _, text = process("import", *options, "--wavelength-nm", 532, "--instrument", instrument, "--out", out)
+    assert code == 0, text
     assert mueller_of(process, out) == pytest.approx(SAMPLE, abs=2e-3)
 
 
@@ -135,11 +135,11 @@ def test_scenes_of_a_polarization_camera_are_not_averaged(configs, tmp_path, pro
     scenes = [tmp_path / f"scene{k}.png" for k in range(3)]
     for k, scene in enumerate(scenes):
         cv2.imwrite(str(scene), np.full((8, 8), 1000 + k, np.uint16))
-    given = ("--wavelength-nm", 550, "--instrument", configs / "instruments" / "linear_stokes.yaml")
-    _, said, _ = process("import", "--stack", tmp_path, *given, "--out", tmp_path / "all.h5")
-    assert "3 frames in which nothing turns: `reduce` averages them. If each is a scene, give the files" in said
-    code, said, _ = process("import", *scenes, *given, "--out", tmp_path / "each")
-    assert (code, said.splitlines()[-1]) == (0, "3 inputs: 3 made, 0 unchanged, 0 failed")
+    options = ("--wavelength-nm", 550, "--instrument", configs / "instruments" / "linear_stokes.yaml")
+    _, text, _ = process("import", "--stack", tmp_path, *options, "--out", tmp_path / "all.h5")
+    assert "3 frames in which nothing turns: `reduce` averages them. If each is a scene, give the files" in text
+    code, text, _ = process("import", *scenes, *options, "--out", tmp_path / "each")
+    assert (code, text.splitlines()[-1]) == (0, "3 inputs: 3 made, 0 unchanged, 0 failed")
     with Capture(tmp_path / "each" / "scene2.h5") as capture:
         assert capture.frames(0)[0, 0, 0] == 1002
 
@@ -161,24 +161,24 @@ def test_several_measurements_in_one_command(day, process):
     runs = sorted(Path().glob("run_*"))
     options = ("--states", "{item}/log.csv", "--stack", "{item}/frames.npy", *day)
     (runs[0] / "log.csv").rename("away.csv")
-    code, said, errors = process("import", *options, *runs, "none")
+    code, text, errors = process("import", *options, *runs, "none")
     assert code == 2
-    assert "4 inputs: 2 made, 0 unchanged, 2 failed" in said
+    assert "4 inputs: 2 made, 0 unchanged, 2 failed" in text
     assert f"{runs[0]}/log.csv: cannot be read" in errors
     Path("away.csv").rename(runs[0] / "log.csv")
-    made = [Path(f"{run}.h5") for run in runs]
-    before = [path.stat().st_mtime_ns for path in made[1:]]
-    code, said, _ = process("import", *options, *runs)
-    assert (code, said.splitlines()[-1]) == (0, "3 inputs: 1 made, 2 unchanged, 0 failed")
-    assert [path.stat().st_mtime_ns for path in made[1:]] == before
-    for path in made:
+    captures = [Path(f"{run}.h5") for run in runs]
+    before = [path.stat().st_mtime_ns for path in captures[1:]]
+    code, text, _ = process("import", *options, *runs)
+    assert (code, text.splitlines()[-1]) == (0, "3 inputs: 1 made, 2 unchanged, 0 failed")
+    assert [path.stat().st_mtime_ns for path in captures[1:]] == before
+    for path in captures:
         assert mueller_of(process, path) == pytest.approx(SAMPLE, abs=2e-3)
     # Another option, or newer frames, are another capture.
     assert process("import", *options, "--black-level", 5, *runs)[0] == 2
     np.save(runs[0] / "frames.npy", np.load(runs[0] / "frames.npy") + 1)
-    code, said, errors = process("import", *options, *runs)
-    assert (code, said.splitlines()[-1]) == (2, "3 inputs: 0 made, 2 unchanged, 1 failed")
-    assert f"{made[0]} exists" in errors
+    code, text, errors = process("import", *options, *runs)
+    assert (code, text.splitlines()[-1]) == (2, "3 inputs: 0 made, 2 unchanged, 1 failed")
+    assert f"{captures[0]} exists" in errors
 
 
 @pytest.mark.parametrize(
@@ -200,9 +200,9 @@ def test_the_stack_of_a_recipe_is_that_of_no_other_measurement(day, process):
     stack = runs[0] / "frames.npy"
     assert process("import", "--states", runs[0] / "log.csv", "--stack", stack, *day, "--out", "first.h5")[0] == 0
     (runs[1] / "frames.npy.csv").write_bytes((runs[1] / "log.csv").read_bytes())
-    given = ("--recipe", "first.import.yaml", runs[1] / "frames.npy")
+    options = ("--recipe", "first.import.yaml", runs[1] / "frames.npy")
     for more in ((), ("--states", "{item}.csv")):
-        code, _, errors = process("import", *given, *more, "--out", "second.h5", "--overwrite")
+        code, _, errors = process("import", *options, *more, "--out", "second.h5", "--overwrite")
         assert code == 0, errors
         with Capture(Path("first.h5")) as first, Capture(Path("second.h5")) as second:
             assert np.array_equal(first.frames(4) + 7, second.frames(4))
@@ -213,7 +213,7 @@ def test_the_data_are_never_replaced_by_their_capture(configs, tmp_path, process
     with h5py.File(file, "w") as h5:
         h5["frames"] = frames_of(configs, "drr_5to1.yaml", drr)[:, 0]
         h5["angles"] = np.stack([drr["psg"], drr["psa"]], axis=1)
-    whole = file.read_bytes()
+    content = file.read_bytes()
     columns = (
         "--columns",
         "psg={item}::/angles[0]",
@@ -222,11 +222,11 @@ def test_the_data_are_never_replaced_by_their_capture(configs, tmp_path, process
         "--stack",
         "{item}::/frames",
     )
-    given = (*columns, "--wavelength-nm", 532, "--instrument", configs / "instruments" / "drr_5to1.yaml", file)
-    code, _, said = process("import", *given, "--overwrite")
-    assert (code, "has the data themselves" in said) == (2, True)
-    assert file.read_bytes() == whole
-    assert process("import", *given, "--out", tmp_path / "capture.h5")[0] == 0
+    options = (*columns, "--wavelength-nm", 532, "--instrument", configs / "instruments" / "drr_5to1.yaml", file)
+    code, _, text = process("import", *options, "--overwrite")
+    assert (code, "has the data themselves" in text) == (2, True)
+    assert file.read_bytes() == content
+    assert process("import", *options, "--out", tmp_path / "capture.h5")[0] == 0
 
 
 def test_two_beams_on_one_sensor(tmp_path, process):
@@ -248,8 +248,8 @@ def test_two_beams_on_one_sensor(tmp_path, process):
         cv2.imwrite(str(tmp_path / f"hwp_{angle}.tif"), frame)
     out = tmp_path / "c.h5"
     command = ("import", "--stack", tmp_path / "hwp_{hwp}.tif", "--wavelength-nm", 550)
-    code, _, said = process(*command, "--instrument", tmp_path / "beams.yaml", "--out", out)
-    assert code == 0, said
+    code, _, err = process(*command, "--instrument", tmp_path / "beams.yaml", "--out", out)
+    assert code == 0, err
     with Capture(out) as capture:
         assert (capture.channel_names, capture.frame_shape) == (("o", "e"), (4, 6))
     assert process("reduce", out, "--no-figure")[0] == 0
@@ -278,22 +278,22 @@ def test_a_stokes_polarimeter_of_twelve_states(configs, tmp_path, process, kind)
         for k, frame in enumerate(frames):
             np.save(tmp_path / "run" / f"s{k}.npy", frame)
         np.save(tmp_path / "angles.npy", angles["psa"])
-        given = ("--stack", tmp_path / "run", "--columns", f"psa={tmp_path}/angles.npy")
+        options = ("--stack", tmp_path / "run", "--columns", f"psa={tmp_path}/angles.npy")
     else:
         savemat(tmp_path / "run.mat", {"img": np.moveaxis(frames, 0, -1), "deg": angles["psa"]})
-        given = ("--stack", f"{tmp_path}/run.mat::img", "--columns", f"psa={tmp_path}/run.mat::deg")
+        options = ("--stack", f"{tmp_path}/run.mat::img", "--columns", f"psa={tmp_path}/run.mat::deg")
     out = tmp_path / "sample.h5"
     instrument = ("--instrument", configs / "instruments" / "rotating_retarder_stokes.yaml")
-    assert process("import", *given, *instrument, "--wavelength-nm", 532, "--out", out)[0] == 0
+    assert process("import", *options, *instrument, "--wavelength-nm", 532, "--out", out)[0] == 0
     assert process("reduce", out, "--no-figure")[0] == 0
     product = out.with_suffix(".stokes.h5")
     image = MuellerImage.load(product)
     assert image.values[:, 0].mean(axis=(1, 2)) / image.values[0, 0].mean() == pytest.approx(SAMPLE[:, 0], abs=2e-3)
     former = product.rename(out.with_suffix(".mueller.h5"))
     for command in ("reduce", "quantities"):
-        code, said, _ = process(command, out, "--no-figure")
+        code, text, _ = process(command, out, "--no-figure")
         assert (code, product.exists()) == (0, False)
-        assert former.name in said
+        assert former.name in text
 
 
 def mueller_of(process, capture):

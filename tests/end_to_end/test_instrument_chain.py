@@ -67,5 +67,5 @@ def test_the_noise_of_a_dark_channel_is_no_tone_curve(gains, is_nominal, configs
     file.write_text(dump_yaml(stated))
     random = np.random.default_rng(4)
     air = emulated_capture(true, Bench({}, {}), np.eye(4), "air", file=file, random=random)
-    found = diagnose_captures([air], stated)[0].diagnosis
-    assert "tone_curve" not in [effect.kind for effect in found.effects]
+    diagnosis = diagnose_captures([air], stated)[0].diagnosis
+    assert "tone_curve" not in [effect.kind for effect in diagnosis.effects]

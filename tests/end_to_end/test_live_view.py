@@ -49,9 +49,9 @@ def running(small_rig, configs, tmp_path):
     )
     url = None
     for line in child.stderr:
-        found = re.search(r"live view: (http://\S+)", line)
-        if found:
-            url = found[1]
+        match = re.search(r"live view: (http://\S+)", line)
+        if match:
+            url = match[1]
             break
     assert url, child.communicate()
     yield child, url, tmp_path / "out"
@@ -113,13 +113,13 @@ def test_page_shows_the_capture_and_its_button_stops_it(running, browser):
 
 def test_everything_needs_the_token_and_a_local_host(running):
     child, url, _ = running
-    own = url.split("/?")[0]
+    origin_url = url.split("/?")[0]
     for path, host, method, origin in (
-        ("/stop", None, "POST", own),
-        ("/stop?token=wrong", None, "POST", own),
+        ("/stop", None, "POST", origin_url),
+        ("/stop?token=wrong", None, "POST", origin_url),
         ("/stop?TOKEN", "evil.example", "POST", "http://evil.example"),
         ("/state?TOKEN", "evil.example", "GET", None),
-        *(("/stop?TOKEN", None, "POST", origin) for origin in (None, "http://evil.example", "null", f"{own}9")),
+        *(("/stop?TOKEN", None, "POST", origin) for origin in (None, "http://evil.example", "null", f"{origin_url}9")),
         ("/state?TOKEN", None, "GET", "http://evil.example"),
         *((path, None, "GET", None) for path in ("/", "/state", "/frame.png", "/quick.png", "/frame.png?token=")),
     ):
@@ -160,8 +160,8 @@ class Told:
 
 def test_many_browsers_that_do_not_read_are_refused_and_keep_nobody_out():
     """Two hundred of them, half of which never finish asking: the run tells on at once, one browser gets through."""
-    told, stuck = Told(), []
-    with told.view as view:
+    page, stuck = Told(), []
+    with page.view as view:
         view.run_started("many", None, 5, None)
         address = view.url.split("//")[1].split("/")[0].split(":")
         for k in range(200):
@@ -174,11 +174,11 @@ def test_many_browsers_that_do_not_read_are_refused_and_keep_nobody_out():
             stuck.append(link)
         for number in range(5):
             start_s = time.thread_time()
-            told.state(number)
+            page.state(number)
             # What the measuring thread itself does for the page, whatever the browsers do.
             assert time.thread_time() - start_s < 0.05
-        found = told.wait_for(lambda state: state["done"] == 5)
-        assert found["title"] == "many"
+        last = page.wait_for(lambda state: state["done"] == 5)
+        assert last["title"] == "many"
         for link in stuck:
             link.close()
 
@@ -204,39 +204,39 @@ def test_the_quick_look_of_a_rotation_is_of_its_light_states_alone():
 
     view = {"title": "x", "done": 1, "role": "sample", "mosaic": None}
     light = np.random.default_rng(3).integers(500, 4000, size=(12, 64, 80), dtype=np.uint16)
-    whole, extremes = (live_process.Shown(64.0, 4095, True) for _ in range(2))
-    whole.update(view | {"title": "before"}, np.full((32, 32), 4000, np.uint16))
+    full, extremes = (live_process.Shown(64.0, 4095, True) for _ in range(2))
+    full.update(view | {"title": "before"}, np.full((32, 32), 4000, np.uint16))
     for done, frame in enumerate(light, start=1):
-        whole.update(view | {"done": done}, frame)
-        assert (whole.picture("quick.png") is None) == (done == 1)
-    whole.update(view | {"done": 13, "role": "dark"}, np.full((64, 80), 60, np.uint16))
+        full.update(view | {"done": done}, frame)
+        assert (full.picture("quick.png") is None) == (done == 1)
+    full.update(view | {"done": 13, "role": "dark"}, np.full((64, 80), 60, np.uint16))
     for done, frame in enumerate((light.min(axis=0), light.max(axis=0)), start=1):
         extremes.update(view | {"done": done}, frame)
-    assert whole.picture("quick.png") == extremes.picture("quick.png")
+    assert full.picture("quick.png") == extremes.picture("quick.png")
     low, high = light.min(axis=0) - 64.0, light.max(axis=0) - 64.0
     tones = (255 * (high - low) / (high + low)).astype(np.uint8)
-    shown = _drawn(whole.picture("quick.png")).astype(int)
+    shown = _drawn(full.picture("quick.png")).astype(int)
     # The two tables differ in rounding.
     assert np.abs(shown - cv2.applyColorMap(tones, cv2.COLORMAP_VIRIDIS)).max() <= 1
 
 
 def test_the_run_goes_on_when_the_process_of_the_page_is_killed():
-    told = Told()
-    with told.view as view:
+    page = Told()
+    with page.view as view:
         view.run_started("killed", None, 5, None)
-        told.wait_for(lambda state: state.get("title") == "killed")
+        page.wait_for(lambda state: state.get("title") == "killed")
         view.process.kill()
         view.process.wait()
         for number in range(20):
-            told.state(number)
-    assert not told.stop.requested
+            page.state(number)
+    assert not page.stop.requested
 
 
 def slow_connections(port, count):
     """Browsers without a token that begin a request and never end it; those given up connect again."""
     import selectors
 
-    ended, made = threading.Event(), threading.Event()
+    ended, connected = threading.Event(), threading.Event()
 
     def attack():
         links = []
@@ -257,13 +257,13 @@ def slow_connections(port, count):
                     with contextlib.suppress(OSError):
                         link.send(b"GET /state HTTP/1.1\r\nHost: 127.0.0.1\r\n")
                     waiting.unregister(link)
-                made.set()
+                connected.set()
         for link in links:
             link.close()
 
     thread = threading.Thread(target=attack, daemon=True)
     thread.start()
-    made.wait()
+    connected.wait()
 
     def end():
         ended.set()
@@ -276,30 +276,30 @@ def slow_connections(port, count):
 def test_stop_answers_under_a_thousand_slow_connections(body):
     """Of strangers without the token, with foreign hosts and origins beside them; a large body is not kept."""
     resource.setrlimit(resource.RLIMIT_NOFILE, (4096, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
-    told = Told()
-    with told.view as view:
+    page = Told()
+    with page.view as view:
         view.run_started("attacked", None, 5, None)
-        told.wait_for(lambda state: state.get("title") == "attacked")
-        own = view.url.split("/?")[0]
-        end = slow_connections(int(own.rsplit(":", 1)[1]), 1000)
-        for host, origin in (("evil.example", own), (None, "http://evil.example")):
+        page.wait_for(lambda state: state.get("title") == "attacked")
+        base = view.url.split("/?")[0]
+        end = slow_connections(int(base.rsplit(":", 1)[1]), 1000)
+        for host, origin in (("evil.example", base), (None, "http://evil.example")):
             with pytest.raises(urllib.error.HTTPError) as refused:
                 _get(view.url, "/stop?TOKEN", host, "POST", origin)
             refused.value.close()
-        assert not told.stop.requested
+        assert not page.stop.requested
         begin_s = time.monotonic()
-        threading.Thread(target=_stop, args=(view.url, own, body), daemon=True).start()
-        while not told.stop.requested and time.monotonic() - begin_s < 20:
+        threading.Thread(target=_stop, args=(view.url, base, body), daemon=True).start()
+        while not page.stop.requested and time.monotonic() - begin_s < 20:
             time.sleep(0.005)
         stopped_s = time.monotonic() - begin_s
         memory = int(re.search(r"VmHWM:\s+(\d+)", Path(f"/proc/{view.process.pid}/status").read_text())[1])
         end()
     print(f"stopped after {stopped_s:.3f} s; memory of the page {memory / 1024:.0f} MiB")
-    assert told.stop.requested
+    assert page.stop.requested
     assert stopped_s < 1.0
     assert memory < 400 << 10
 
 
-def _stop(url, own, body):
+def _stop(url, base, body):
     with contextlib.suppress(OSError, urllib.error.URLError):
-        _get(url, "/stop?TOKEN", method="POST", origin=own, data=bytes(body))
+        _get(url, "/stop?TOKEN", method="POST", origin=base, data=bytes(body))

@@ -59,12 +59,12 @@ def test_after_an_exposure_that_the_camera_refuses_it_takes_frames_with_the_one_
 
 def test_its_own_acquisition_engine_steps_a_rotator_and_takes_frames(core, rig):
     core.setFocusDevice("psg")
-    taken = []
-    core.mda.events.frameReady.connect(lambda frame, event: taken.append((event.z_pos, frame.copy())))
+    events = []
+    core.mda.events.frameReady.connect(lambda frame, event: events.append((event.z_pos, frame.copy())))
     sequence = MDASequence(z_plan={"absolute": ANGLES}, channels=[])
     core.mda.run(sequence)
-    assert [angle for angle, _ in taken] == ANGLES
-    frames = np.stack([frame for _, frame in taken]).astype(float)
+    assert [angle for angle, _ in events] == ANGLES
+    frames = np.stack([frame for _, frame in events]).astype(float)
     assert frames.shape == (3, 24, 32)
     # A plate that turns between polarizers modulates the light.
     assert np.ptp(frames.mean(axis=(1, 2))) > 0.02 * frames.mean()

@@ -40,7 +40,7 @@ def run(capfd):
 
 
 @pytest.fixture(scope="module")
-def taken(tmp_path_factory, configs):
+def simulated_capture(tmp_path_factory, configs):
     folder = tmp_path_factory.mktemp("taken")
     with pytest.raises(SystemExit) as end:
         acquire_main(["--omega", "35", "--rig", str(write_rig(configs, folder / "rig.yaml")), "--out", str(folder)])
@@ -50,9 +50,9 @@ def taken(tmp_path_factory, configs):
 
 
 @pytest.fixture
-def capture(taken, tmp_path):
+def capture(simulated_capture, tmp_path):
     """A capture that a test may lose, alone in its folder."""
-    return Path(shutil.copy(taken, tmp_path))
+    return Path(shutil.copy(simulated_capture, tmp_path))
 
 
 def test_options_that_do_not_fit_are_told_before_the_work_and_not_passed_over(run, capture):
@@ -75,14 +75,14 @@ def test_a_place_for_no_file_is_refused_before_the_work(acquire, small_rig, capt
     with pytest.raises(SystemExit) as end:
         diagnose([str(capture), "--instrument", str(configs / "instruments/rgb950.yaml"), "--write", "no/where.yaml"])
     assert end.value.code == 2
-    told = "error: no/where.yaml: there is no folder no. Make it, or give another name.\n"
-    assert capfd.readouterr() == ("", told)
+    message = "error: no/where.yaml: there is no folder no. Make it, or give another name.\n"
+    assert capfd.readouterr() == ("", message)
     free = ("--free", "psa_retarder.retardance_deg", "--write", "no/where.yaml")
     instrument = str(configs / "instruments/rgb950.yaml")
     with pytest.raises(SystemExit) as end:
         process(["calibrate", str(capture), "--instrument", instrument, *free])
     # Not a word of the fit before.
-    assert (end.value.code, *capfd.readouterr()) == (2, "", told)
+    assert (end.value.code, *capfd.readouterr()) == (2, "", message)
 
 
 def test_another_camera_s_instrument_file_and_a_place_for_no_figure_are_named(run, capture, configs, tmp_path, capfd):
@@ -117,14 +117,14 @@ def test_another_camera_s_instrument_file_and_a_place_for_no_figure_are_named(ru
 def test_what_was_measured_is_never_replaced(run, capture, tmp_path):
     """`--overwrite` is for what can be made again: a reduction with the wrong --out took its capture's place."""
     raw = capture.read_bytes()
-    other = tmp_path / "other.h5"
-    other.write_bytes(raw)
+    second = tmp_path / "other.h5"
+    second.write_bytes(raw)
     assert run("reduce", capture, "--out", tmp_path / "m.h5", "--no-figure") == (0, "")
     for command in (("reduce", capture), ("xi0", tmp_path / "m.h5"), ("report", tmp_path / "m.h5")):
-        for out in (capture, other):
+        for out in (capture, second):
             code, err = run(*command, "--out", out, "--overwrite")
             assert (code, f"{out} is a capture, and is not replaced" in err) == (2, True), err
-    assert capture.read_bytes() == other.read_bytes() == raw
+    assert capture.read_bytes() == second.read_bytes() == raw
     # A product still is.
     assert run("reduce", capture, "--out", tmp_path / "m.h5", "--no-figure", "--overwrite") == (0, "")
 
@@ -161,8 +161,8 @@ def test_a_file_that_is_not_meant_is_called_what_it_is(run, acquire, capture, co
     # Products and tables lie beside captures; none is a damaged capture.
     with h5py.File(tmp_path / "table.h5", "w") as h5:
         h5.attrs["umov_table"] = 1
-    found, _, left_out, damaged = find_captures(tmp_path)
-    assert ([path for path, *_ in found], left_out, damaged) == ([capture], [], [])
+    captures, _, left_out, damaged = find_captures(tmp_path)
+    assert ([path for path, *_ in captures], left_out, damaged) == ([capture], [], [])
     for command in ("verify", "repair"):
         code, out, err = acquire(command, tmp_path)
         assert (code, err) == (0, "")

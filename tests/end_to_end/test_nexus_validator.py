@@ -24,7 +24,7 @@ STATES, SHAPE = 24, (6, 8)
 
 
 @pytest.fixture
-def found(caplog) -> Callable[[Path], list[str]]:
+def complaints(caplog) -> Callable[[Path], list[str]]:
     """What `pynx validate --ignore-undocumented FILE` says of a file beside that it is valid."""
     reason = "pynxtools is not installed: .ci/nexus brings it and runs this"
     validator = pytest.importorskip("pynxtools.dataconverter.validate_file", reason=reason)
@@ -33,10 +33,10 @@ def found(caplog) -> Callable[[Path], list[str]]:
         caplog.clear()
         with caplog.at_level(logging.INFO):
             validator.validate(str(path), ignore_undocumented=True)
-        said = [record.getMessage() for record in caplog.records if record.name.startswith("pynxtools")]
+        lines = [record.getMessage() for record in caplog.records if record.name.startswith("pynxtools")]
         valid = f"The entry `entry` in file `{path}` is valid according to the `NXoptical_spectroscopy` application"
-        assert any(line.startswith(valid) for line in said), said
-        return [line for line in said if not line.startswith(valid)]
+        assert any(line.startswith(valid) for line in lines), lines
+        return [line for line in lines if not line.startswith(valid)]
 
     return run
 
@@ -63,13 +63,15 @@ def capture(synthetic_capture, configs: Path, name: str, **header: object) -> Pa
 
 def captures(synthetic_capture, configs: Path) -> list[Path]:
     """Complete, under way, compressed."""
-    whole, partial, packed = (capture(synthetic_capture, configs, f"{name}.h5") for name in ("c", "partial", "packed"))
+    complete, partial, packed = (
+        capture(synthetic_capture, configs, f"{name}.h5") for name in ("c", "partial", "packed")
+    )
     with h5py.File(partial, "r+") as h5:
         h5["entry/states/done"][STATES // 2 :] = 0
         del h5["entry/closing"]
         write_closing(h5, "aborted", {})
     assert pack_capture(packed)
-    return [whole, partial, packed]
+    return [complete, partial, packed]
 
 
 def made_of(source: Path) -> list[Path]:
@@ -104,18 +106,18 @@ def table(path: Path) -> Path:
     return path
 
 
-def test_every_kind_of_file_is_valid(found, synthetic_capture, configs, tmp_path):
+def test_every_kind_of_file_is_valid(complaints, synthetic_capture, configs, tmp_path):
     files = captures(synthetic_capture, configs)
     files += [*made_of(files[0]), *laid_out(tmp_path), table(tmp_path / "table.h5")]
     assert len(files) == 12
-    others = [f"{path.name}: {line}" for path in files for line in found(path) if not line.startswith(OURS)]
-    assert others == []
+    unexpected = [f"{path.name}: {line}" for path in files for line in complaints(path) if not line.startswith(OURS)]
+    assert unexpected == []
 
 
-def test_the_validator_sees_what_is_missing(found, tmp_path):
+def test_the_validator_sees_what_is_missing(complaints, tmp_path):
     """That the test above can fail."""
     path = table(tmp_path / "table.h5")
     with h5py.File(path, "r+") as h5:
         del h5["entry/experiment_type"]
     with pytest.raises(AssertionError, match="experiment_type"):
-        found(path)
+        complaints(path)

@@ -35,13 +35,13 @@ def heard(tmp_path):
 
 
 def test_end_interlock_and_failure_are_told_to_a_command(heard, tmp_path):
-    command, told = heard
+    command, messages = heard
     with notifying(NotifyConfig(command=command), tmp_path / "c.h5", True) as notifier:
         notifier.warning("a frame was lost")
         notifier.warning("interlock: the door is open; the state is discarded")
         notifier.settle()
         notifier.tell("end", "44 of 44 states, complete")
-    first, last = told()
+    first, last = messages()
     words, message = last.split("|")
     assert words == "SIMULATED end: 44 of 44 states, complete"
     assert json.loads(message) | {"event": "end", "simulated": True, "what": str(tmp_path / "c.h5")} == json.loads(
@@ -50,11 +50,11 @@ def test_end_interlock_and_failure_are_told_to_a_command(heard, tmp_path):
     assert first.startswith("SIMULATED interlock: interlock: the door is open")
     with pytest.raises(AcquisitionError), notifying(NotifyConfig(command=command), tmp_path, False):
         raise AcquisitionError("psg stalled")
-    assert told()[2].startswith("failure: psg stalled|")
+    assert messages()[2].startswith("failure: psg stalled|")
 
 
 def test_only_what_was_asked_for_is_told_and_a_command_that_fails_harms_nothing(heard, tmp_path):
-    command, told = heard
+    command, messages = heard
     with notifying(NotifyConfig(command=command, on=("failure",)), tmp_path, False) as notifier:
         notifier.tell("end", "complete")
     with notifying(
@@ -63,7 +63,7 @@ def test_only_what_was_asked_for_is_told_and_a_command_that_fails_harms_nothing(
         notifier.tell("end", "complete")
     with notifying(None, tmp_path, False) as notifier:
         notifier.tell("end", "complete")
-    assert told() == []
+    assert messages() == []
 
 
 def test_a_webhook_gets_the_same_as_json(tmp_path):
@@ -106,20 +106,20 @@ def test_the_summary_names_what_is_missing(tmp_path):
 def test_a_stopped_campaign_is_processed_without_what_is_not_complete(synthetic_capture, tmp_path):
     frames = np.full((4, 1, 6, 8), 900, np.uint16)
     angles = {"psg": np.arange(4.0), "psa": np.arange(4.0)}
-    whole = synthetic_capture(frames, angles, name="whole.h5", omega_deg=35.0)
+    complete = synthetic_capture(frames, angles, name="whole.h5", omega_deg=35.0)
     synthetic_capture(frames, angles, name="half.h5", omega_deg=40.0, done=np.array([1, 1, 0, 0]))
     synthetic_capture(frames, angles, name="cut.h5.partial", omega_deg=45.0, done=0)
     (tmp_path / "index.json").write_text(
         json.dumps({"whole.h5": {"status": "complete"}, "gone.h5": {"status": "failed"}})
     )
-    found, simulated, left_out, damaged = find_captures(tmp_path)
-    assert [path for path, *_ in found] == [whole]
+    captures, simulated, left_out, damaged = find_captures(tmp_path)
+    assert [path for path, *_ in captures] == [complete]
     assert simulated
     assert not damaged
     assert any("half.h5: 2 of 4 states" in line for line in left_out)
     assert any("cut.h5.partial: a capture that is not finished" in line for line in left_out)
     assert any("gone.h5: failed" in line for line in left_out)
-    whole.unlink()
+    complete.unlink()
     with pytest.raises(ProcessError, match="no complete capture"):
         find_captures(tmp_path)
 

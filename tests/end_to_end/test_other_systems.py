@@ -35,10 +35,10 @@ def test_import_reduce_and_diagnose_where_linux_has_no_part(tmp_path, configs):
 
     instrument = configs / "instruments/drr_imaging_630nm.yaml"
     sample = ("--sample", "mirror", "--wavelength-nm", table.wavelength_nm, "--instrument", instrument)
-    given = ("process", "import", "--states", states, "--out", "mirror.h5", *sample)
-    others = (("process", command, "mirror.h5") for command in ("reduce", "xi0", "quantities", "report"))
+    import_line = ("process", "import", "--states", states, "--out", "mirror.h5", *sample)
+    steps = (("process", command, "mirror.h5") for command in ("reduce", "xi0", "quantities", "report"))
     refused = ("process", "export", "mirror.mueller.h5", "--to", "csv")
-    words = [[str(word) for word in line] for line in (given, *others, ("diagnose", "mirror.h5"), refused)]
+    words = [[str(word) for word in line] for line in (import_line, *steps, ("diagnose", "mirror.h5"), refused)]
     # In one program: it is loaded once.
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", WITHOUT],

@@ -36,9 +36,9 @@ def capture(synthetic_capture, configs, tmp_path) -> Path:
     frames = np.random.default_rng(3).integers(400, 3000, (STATES, 1, *SHAPE), dtype=np.uint16)
     detector = {"gain_e_per_count": 2.5, "read_noise_e": 4.0, "bits": 12}
     angles = {"psg": psg, "psa": psg * 4.91, "arm": np.full(STATES, 35.0)}
-    made = synthetic_capture(frames, angles, instrument_yaml=text, detector=detector)
+    path = synthetic_capture(frames, angles, instrument_yaml=text, detector=detector)
     # Where the lines of the docs look for it.
-    return made.rename(made.parent / "captures" / "drr_omega35.h5")
+    return path.rename(path.parent / "captures" / "drr_omega35.h5")
 
 
 @pytest.fixture
@@ -77,20 +77,20 @@ def test_the_lines_in_the_docs_open_both_with_xarray(capture, product, monkeypat
 
 
 def test_xarray_sees_the_bins_of_a_scattering_table(table):
-    there = ScatteringTable.load(table)
+    stored = ScatteringTable.load(table)
     with xr.open_dataset(table, engine="h5netcdf", group="entry/data") as bins:
         assert bins["mean"].dims == ("quantity", "bin")
-        assert [*bins["quantity_name"].values.astype(str)] == list(there.quantities)
-        np.testing.assert_array_equal(bins["mean"], there.mean)
-        np.testing.assert_array_equal(bins["sample_variance"], there.variance)
+        assert [*bins["quantity_name"].values.astype(str)] == list(stored.quantities)
+        np.testing.assert_array_equal(bins["mean"], stored.mean)
+        np.testing.assert_array_equal(bins["sample_variance"], stored.variance)
         assert bins["directions"].dims == ("input", "quantity", "bin")
-        assert [*bins["input_name"].values.astype(str)] == list(there.inputs)
-        for name, values in there.uncertainties.items():
+        assert [*bins["input_name"].values.astype(str)] == list(stored.inputs)
+        for name, values in stored.uncertainties.items():
             assert bins[name].dtype == np.float32
             np.testing.assert_allclose(bins[name], values, rtol=1e-6)
-        np.testing.assert_array_equal(bins["bin"], there.bins)
+        np.testing.assert_array_equal(bins["bin"], stored.bins)
         at = Angles(*(np.deg2rad(bins[name].values) for name in ("theta_h_deg", "theta_d_deg", "phi_d_deg")))
-        np.testing.assert_array_equal(there.axes.bins(at), there.bins)
+        np.testing.assert_array_equal(stored.axes.bins(at), stored.bins)
         assert set(bins["mean"].coords) >= {"theta_h_deg", "theta_d_deg", "phi_d_deg", "count", "quantity_name"}
 
 
@@ -171,9 +171,9 @@ def test_a_file_with_the_older_layout_is_read_and_written_in_its_place(capture):
     file.add_segment_record({"event": "begin"})
     file.write_closing({"end_time": "now"})
     file.close()
-    with Capture(capture) as there:
-        assert there.closing == {"end_time": "now"}
-        assert len(there.frames(3)[0]) == SHAPE[0]
+    with Capture(capture) as reader:
+        assert reader.closing == {"end_time": "now"}
+        assert len(reader.frames(3)[0]) == SHAPE[0]
 
 
 def test_xarray_is_shown_the_records_as_they_are(capture):
@@ -221,10 +221,10 @@ def test_compressed_planes_are_plain_deflate_and_read_the_same(tmp_path):
 def exported(product, capture, tmp_path, capsys):
     """Runs `process export`; the files it names."""
 
-    def run(which: str, *options: str) -> list[Path]:
+    def run(source: str, *options: str) -> list[Path]:
         capsys.readouterr()
         with pytest.raises(SystemExit) as end:
-            main(["export", str({"product": product, "capture": capture}[which]), "--out", f"{tmp_path}/e", *options])
+            main(["export", str({"product": product, "capture": capture}[source]), "--out", f"{tmp_path}/e", *options])
         assert end.value.code == 0, capsys.readouterr().err
         return [Path(line) for line in capsys.readouterr().out.split()]
 
@@ -279,8 +279,8 @@ def test_noise_and_the_instruments_part_leave_with_their_names(capture, configs,
     stated = tmp_path / "stated.yaml"
     stated.write_text(re.sub(r"retardance_deg: ([0-9.]+)", r"retardance_deg: {value: \1, u: 0.3}", text))
     product = Xi0(Reduction(capture, stated).make(tmp_path / "m.mueller.h5")).make()
-    names, there = ["xi0_errors", "xi0_systematic"], open_dataset(product)
-    assert "retardance_deg" in there.attrs["uncertain_in_the_instrument"]
+    names, dataset = ["xi0_errors", "xi0_systematic"], open_dataset(product)
+    assert "retardance_deg" in dataset.attrs["uncertain_in_the_instrument"]
     files = export(product, to, tmp_path / "x", names)
     if to == "csv":
         read = pandas.read_csv(files[0], comment="#")
@@ -294,7 +294,9 @@ def test_noise_and_the_instruments_part_leave_with_their_names(capture, configs,
         assert [path.name for path in files] == [f"x.{name}.tif" for name in names]
         return
     for name in names:
-        np.testing.assert_array_equal(np.asarray(read[name], np.float32), there[name].values.ravel().astype(np.float32))
+        np.testing.assert_array_equal(
+            np.asarray(read[name], np.float32), dataset[name].values.ravel().astype(np.float32)
+        )
 
 
 def test_an_exported_scattering_table_reads_back_exactly(tmp_path, table, capsys):
@@ -308,10 +310,10 @@ def test_an_exported_scattering_table_reads_back_exactly(tmp_path, table, capsys
         "theta_h_deg", "theta_d_deg", "phi_d_deg", "samples",
         "xi0", "xi0_u_noise", "xi0_u_systematic", "xi0_sample_variance",
     ]  # fmt: skip
-    there = Angles(*(np.deg2rad(read[name]) for name in ("theta_h_deg", "theta_d_deg", "phi_d_deg")))
+    angles = Angles(*(np.deg2rad(read[name]) for name in ("theta_h_deg", "theta_d_deg", "phi_d_deg")))
     assert len(read) == table.bins.size
-    np.testing.assert_array_equal(table.counts(there), read["samples"])
-    np.testing.assert_array_equal(table.lookup(there)[0], read["xi0"])
+    np.testing.assert_array_equal(table.counts(angles), read["samples"])
+    np.testing.assert_array_equal(table.lookup(angles)[0], read["xi0"])
     order = np.argsort(table.bins)
     for name, values in table.uncertainties.items():
         np.testing.assert_array_equal(values[0, order], read[f"xi0_{name}"])
@@ -359,15 +361,15 @@ def test_the_colour_bar_of_a_mueller_image_has_an_arrow_where_values_lie_beyond_
 def test_a_mueller_image_alone_is_exported_as_its_own_figure(exported, tmp_path):
     (alone,) = exported("product", "--to", "png", "--plane", "mueller", "--out", f"{tmp_path}/alone.png")
     assert alone.name == "alone.png"
-    (whole,) = exported("product", "--to", "png", "--out", f"{tmp_path}/whole")
-    assert alone.read_bytes() == whole.read_bytes()
+    (figure,) = exported("product", "--to", "png", "--out", f"{tmp_path}/whole")
+    assert alone.read_bytes() == figure.read_bytes()
 
 
 @pytest.mark.long
 def test_figures_are_written_and_nothing_is_replaced(exported, product, tmp_path, capsys):
     path = exported("product", "--to", "pdf", "--plane", "mueller_errors")[0]
     assert path.read_bytes().startswith(b"%PDF")
-    for options, told in (
+    for options, message in (
         (["--to", "pdf", "--plane", "mueller"], "exists"),
         (["--to", "doc"], "unknown format"),
         (["--to", "nexus"], "is a NeXus file (HDF5) already"),
@@ -376,4 +378,4 @@ def test_figures_are_written_and_nothing_is_replaced(exported, product, tmp_path
         with pytest.raises(SystemExit) as end:
             main(["export", str(product), "--out", f"{tmp_path}/e", *options])
         assert end.value.code == 2
-        assert told in capsys.readouterr().err
+        assert message in capsys.readouterr().err

@@ -47,8 +47,8 @@ def the_budget_adds_up(text: str) -> None:
 
 
 def the_fault_is_found_and_psi_is_the_better_for_it(text: str) -> None:
-    found = re.search(r"found: psg_azimuth.*?azimuth ([0-9.]+) ± ([0-9.]+)", text, re.S)
-    assert found is not None
-    assert float(found[1]) == pytest.approx(2.0, abs=5 * float(found[2]))
+    match = re.search(r"found: psg_azimuth.*?azimuth ([0-9.]+) ± ([0-9.]+)", text, re.S)
+    assert match is not None
+    assert float(match[1]) == pytest.approx(2.0, abs=5 * float(match[2]))
     before, after = (float(cell) for cell in cells(text.split("Before and after")[1], "662 nm")[1:3])
     assert after < 0.95 * before

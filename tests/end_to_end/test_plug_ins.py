@@ -74,9 +74,9 @@ def test_a_rig_file_and_an_instrument_file_use_it(run, small_rig, configs, tmp_p
     done = run("-c", acquire, "--omega", 35, "--rig", "rig.yaml", "--out", "out")
     assert done.returncode == 0, done.stderr
     (capture,) = (tmp_path / "out").glob("*.h5")
-    with Capture(capture) as taken:
+    with Capture(capture) as reader:
         for kind in ("sample_stage", "sample_camera", "sample_lamp"):
-            assert f'"{kind}"' in taken.header.devices_json
+            assert f'"{kind}"' in reader.header.devices_json
     code = """
 import sys
 from processing import reduce_to_dataset

@@ -153,10 +153,10 @@ def test_bad_captures(measured: Measured, instrument: Path, process: Run, tmp_pa
     code, _, err = process("reduce", truncated)
     assert code == 2
     assert "truncated" in err
-    other = tmp_path / "other.h5"
-    with h5py.File(other, "w") as h5:
+    foreign = tmp_path / "other.h5"
+    with h5py.File(foreign, "w") as h5:
         h5["x"] = 1
-    code, _, err = process("reduce", other)
+    code, _, err = process("reduce", foreign)
     assert code == 2
     assert "no umov capture" in err
     before = sorted(tmp_path.iterdir())
@@ -230,7 +230,7 @@ def test_xi0_reduces_first_and_reuses_the_product(
 
 def test_instrument_of_another_wavelength(measured: Measured, tmp_path: Path, configs: Path, process: Run) -> None:
     assert process("import", "--states", measured.states, "--wavelength-nm", 662)[0] == 0
-    other = configs / "instruments/drr_imaging_630nm.yaml"
-    code, _, err = process("reduce", tmp_path / "states.h5", "--instrument", other)
+    imaging = configs / "instruments/drr_imaging_630nm.yaml"
+    code, _, err = process("reduce", tmp_path / "states.h5", "--instrument", imaging)
     assert code == 2
     assert "is given at 630 nm; asked for 662 nm" in err

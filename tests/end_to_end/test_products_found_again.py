@@ -57,7 +57,7 @@ def capture(original: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def other(configs: Path, tmp_path: Path) -> Path:
+def edited(configs: Path, tmp_path: Path) -> Path:
     """An instrument file that gives other numbers."""
     text = (configs / "instruments/rgb950.yaml").read_text()
     assert "662: 127.12" in text
@@ -84,33 +84,33 @@ def truth(original: Path, tmp_path: Path) -> np.ndarray:
 def test_a_weighted_product_is_neither_replaced_nor_taken_for_the_plain_one(capture, process, truth, touched):
     process("reduce", capture, "--weighted", "--no-figure")
     product = capture.with_suffix(".mueller.h5")
-    kept = product.read_bytes()
+    content = product.read_bytes()
     if touched:
         later = product.stat().st_mtime + 100
         os.utime(capture, (later, later))
     process("xi0", capture, "--no-figure")
-    assert product.read_bytes() == kept
+    assert product.read_bytes() == content
     np.testing.assert_array_equal(xi0_of(capture.with_suffix(".xi0.h5")), truth)
     # The plain product has a name of its own, and is found again by it.
-    (own,) = capture.parent.glob("c.mueller-*.h5")
-    assert own.stem.endswith((made_of(own) or "")[:8])
-    assert f"using {own}" in process("xi0", capture, "--no-figure", "--overwrite")
+    (weighted,) = capture.parent.glob("c.mueller-*.h5")
+    assert weighted.stem.endswith((made_of(weighted) or "")[:8])
+    assert f"using {weighted}" in process("xi0", capture, "--no-figure", "--overwrite")
 
 
-def test_xi0_does_not_depend_on_the_instrument_used_before(capture, other, process, truth):
-    process("xi0", capture, "--instrument", other, "--out", capture.with_name("other.h5"), "--no-figure")
+def test_xi0_does_not_depend_on_the_instrument_used_before(capture, edited, process, truth):
+    process("xi0", capture, "--instrument", edited, "--out", capture.with_name("other.h5"), "--no-figure")
     assert np.nanmedian(np.abs(xi0_of(capture.with_name("other.h5")) - truth)) > 0.003
     process("xi0", capture, "--no-figure")
     np.testing.assert_array_equal(xi0_of(capture.with_suffix(".xi0.h5")), truth)
     # Nor does that with the other instrument depend on the plain one.
-    process("xi0", capture, "--instrument", other, "--out", capture.with_name("again.h5"), "--no-figure")
+    process("xi0", capture, "--instrument", edited, "--out", capture.with_name("again.h5"), "--no-figure")
     np.testing.assert_array_equal(xi0_of(capture.with_name("again.h5")), xi0_of(capture.with_name("other.h5")))
-    other.write_text(other.read_text().replace("117.0", "127.12"))
-    process("xi0", capture, "--instrument", other, "--out", capture.with_name("right.h5"), "--no-figure")
+    edited.write_text(edited.read_text().replace("117.0", "127.12"))
+    process("xi0", capture, "--instrument", edited, "--out", capture.with_name("right.h5"), "--no-figure")
     np.testing.assert_allclose(xi0_of(capture.with_name("right.h5")), truth, atol=1e-6)
 
 
-def test_time_stamps_and_places_count_for_nothing(capture, other, process, tmp_path):
+def test_time_stamps_and_places_count_for_nothing(capture, edited, process, tmp_path):
     process("reduce", capture, "--no-figure")
     moved = tmp_path / "moved"
     moved.mkdir()
@@ -130,23 +130,23 @@ def test_time_stamps_and_places_count_for_nothing(capture, other, process, tmp_p
     assert len(list(moved.glob("c.mueller-*.h5"))) == 1
 
 
-def test_what_a_step_is_made_of(capture, other, tmp_path, monkeypatch):
+def test_what_a_step_is_made_of(capture, edited, tmp_path, monkeypatch):
     plain = Reduction(capture)
-    seen = [plain.record().made_of]
-    changed = [replace(plain, weighted=True), replace(plain, physical="nearest"), replace(plain, instrument=other)]
+    keys = [plain.record().made_of]
+    changed = [replace(plain, weighted=True), replace(plain, physical="nearest"), replace(plain, instrument=edited)]
     changed += [
         replace(plain, weighted=True, covariance=True),
         replace(plain, dark=capture),
         replace(plain, flat=(capture,)),
     ]
     for step in changed:
-        assert step.record().made_of not in seen
-        seen.append(step.record().made_of)
+        assert step.record().made_of not in keys
+        keys.append(step.record().made_of)
     monkeypatch.setattr(provenance, "program", lambda: "another")
-    assert plain.record().made_of not in seen
+    assert plain.record().made_of not in keys
     monkeypatch.undo()
     product = plain.make()
-    assert made_of(product) == plain.record().made_of == seen[0]
+    assert made_of(product) == plain.record().made_of == keys[0]
     # A later step knows its source by what that was made of, so that making it again changes nothing.
     first = Quantities(product).record().made_of
     plain.make(overwrite=True)
@@ -243,14 +243,14 @@ def test_a_table_is_not_replaced_and_counts_no_image_twice(capture, configs, pro
     geometry, out = configs / "geometries/one_inch_sphere.yaml", tmp_path / "t.h5"
     table = ("table", product, "--geometry", geometry, "--out", out)
     process(*table)
-    count, kept = ScatteringTable.load(out).count.sum(), out.read_bytes()
+    count, content = ScatteringTable.load(out).count.sum(), out.read_bytes()
     assert [s.name for s in table_steps(out)] == ["table"]
     for options, message in (((), "exists"), (("--append",), "would count twice")):
         with pytest.raises(SystemExit) as ended:
             main([str(a) for a in (*table, *options)])
         assert ended.value.code == 2
         assert message in capfd.readouterr().err
-        assert out.read_bytes() == kept
+        assert out.read_bytes() == content
     weighted = Reduction(capture, weighted=True).make(tmp_path / "w.h5")
     process("table", weighted, *table[2:], "--append")
     assert ScatteringTable.load(out).count.sum() == 2 * count

@@ -43,13 +43,13 @@ def source(tmp_path) -> Path:
 
 
 @pytest.fixture
-def known(source, monkeypatch, tmp_path):
+def requests(source, monkeypatch, tmp_path):
     """The catalogue holds one set, whose repository is on this machine; returns the requests that were made."""
-    asked: list[str] = []
+    paths: list[str] = []
 
     class Quiet(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *_: object) -> None:
-            asked.append(self.path)
+            paths.append(self.path)
 
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=tmp_path / "served"))
     thread = threading.Thread(target=server.serve_forever)
@@ -58,7 +58,7 @@ def known(source, monkeypatch, tmp_path):
         SetFile(path=f"deep/{path.name}", sha256=hashlib.sha256(path.read_bytes()).hexdigest())
         for path in sorted(source.iterdir())
     ]
-    one = PublicSet(
+    public_set = PublicSet(
         title="two channels",
         source=f"http://127.0.0.1:{server.server_port}",
         commit=COMMIT,
@@ -67,9 +67,9 @@ def known(source, monkeypatch, tmp_path):
         instrument="drr_wollaston.yaml",
         files=tuple(files),
     )
-    monkeypatch.setattr(sets, "catalogue", lambda: {NAME: one})
+    monkeypatch.setattr(sets, "catalogue", lambda: {NAME: public_set})
     monkeypatch.setattr("processing.public_data.sets.SHIPPED", tmp_path / "nothing")
-    yield asked
+    yield paths
     server.shutdown()
     thread.join()
     server.server_close()
@@ -77,9 +77,9 @@ def known(source, monkeypatch, tmp_path):
     gc.collect()
 
 
-def test_a_set_is_downloaded_once_and_becomes_captures(data, known, tmp_path):
+def test_a_set_is_downloaded_once_and_becomes_captures(data, requests, tmp_path):
     code, out, _ = data("get", NAME)
-    assert (code, len(known)) == (0, 2)
+    assert (code, len(requests)) == (0, 2)
     assert "licence: MIT" in out
     assert "2 inputs: 2 made, 0 unchanged, 0 failed" in out
     with Capture(tmp_path / "data" / NAME / "air_1300nm.h5") as capture:
@@ -90,12 +90,12 @@ def test_a_set_is_downloaded_once_and_becomes_captures(data, known, tmp_path):
         np.testing.assert_allclose(capture.frames(0)[:, 0, 0], [1500, 500])
     written = {path: path.stat().st_mtime_ns for path in (tmp_path / "data").rglob("*")}
     code, out, _ = data("get", NAME)
-    assert (code, len(known)) == (0, 2)
+    assert (code, len(requests)) == (0, 2)
     assert "2 inputs: 0 made, 2 unchanged, 0 failed" in out
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "data").rglob("*")} == written
 
 
-def test_other_content_than_that_of_the_catalogue_is_refused(data, known, source, tmp_path):
+def test_other_content_than_that_of_the_catalogue_is_refused(data, requests, source, tmp_path):
     (source / "cal_results.json").write_text("{}")
     code, _, err = data("get", NAME)
     assert code == 2
@@ -106,17 +106,17 @@ def test_other_content_than_that_of_the_catalogue_is_refused(data, known, source
 
 # requests leaves the socket of an answer 404 to the garbage collector.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_folder_in_place_of_the_network(data, known, source, tmp_path, monkeypatch):
-    own = tmp_path / "own" / NAME
-    own.mkdir(parents=True)
+def test_a_folder_in_place_of_the_network(data, requests, source, tmp_path, monkeypatch):
+    folder = tmp_path / "own" / NAME
+    folder.mkdir(parents=True)
     for file in source.iterdir():
-        file.rename(own / file.name)
+        file.rename(folder / file.name)
     monkeypatch.setenv("UMOV_DATA", str(tmp_path / "own"))
     code, _, _ = data("get", NAME, "--out", tmp_path / "made")
-    assert (code, known) == (0, [])
+    assert (code, requests) == (0, [])
     assert (tmp_path / "made" / "plate_1300nm.h5").exists()
     # A changed file is not taken for it.
-    (own / "cal_results.json").write_text("{}")
+    (folder / "cal_results.json").write_text("{}")
     code, _, err = data("get", NAME)
     assert (code, "cannot be downloaded" in err) == (2, True)
     monkeypatch.setenv("UMOV_DATA", str(tmp_path / "elsewhere"))
@@ -134,22 +134,22 @@ def test_what_the_repository_holds_needs_no_network(data):
 def test_list_and_page_name_source_commit_licence_and_citation(data):
     _, out, _ = data("list")
     page = PAGE.read_text(encoding="utf-8")
-    for name, known in catalogue().items():
-        for text in (name, known.licence, known.source, known.doi):
+    for name, entry in catalogue().items():
+        for text in (name, entry.licence, entry.source, entry.doi):
             assert text in out
             assert text in page
-        assert known.citation in out
-        assert known.commit[:12] in out
-        assert known.commit in page
-        assert all(len(file.sha256) == 64 for file in known.all_files())
+        assert entry.citation in out
+        assert entry.commit[:12] in out
+        assert entry.commit in page
+        assert all(len(file.sha256) == 64 for file in entry.all_files())
 
 
 def test_every_shipped_set_has_a_licence_and_a_source():
-    known = catalogue()
+    entries = catalogue()
     folders = [path for path in SHIPPED.iterdir() if path.is_dir()]
-    assert {path.name for path in folders} == {name for name, one in known.items() if one.in_repository}
+    assert {path.name for path in folders} == {name for name, entry in entries.items() if entry.in_repository}
     for folder in folders:
         about = (folder / "README.md").read_text(encoding="utf-8")
-        assert known[folder.name].source in about
-        assert known[folder.name].commit in about
+        assert entries[folder.name].source in about
+        assert entries[folder.name].commit in about
         assert (folder / "LICENSE").exists() or "creativecommons.org/licenses/by/4.0" in about

@@ -31,7 +31,7 @@ WITH_EXAMPLES = [
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory, configs):
+def captures(tmp_path_factory, configs):
     """Folder with sphere.h5, sphere_60.h5, mosaic.h5, air.h5, files of an instrument, a rig and so on."""
     folder = tmp_path_factory.mktemp("examples")
     shutil.copy(configs / "instruments/rgb950.yaml", folder / "instrument.yaml")
@@ -46,15 +46,15 @@ def made(tmp_path_factory, configs):
     off = declared.with_values({"psg_retarder": {"azimuth_deg": {nm: deg + 0.5 for nm, deg in azimuth.items()}}})
     mosaic = InstrumentModel.load(configs / "instruments/linear_stokes.yaml")
     scenes = {scene: Scene.load(configs / f"scenes/{scene}.yaml") for scene in ("red_sphere", "air")}
-    for name, scene, omega, true, said in (
+    for name, scene, omega, true, model in (
         ("sphere", "red_sphere", 35, declared, declared),
         ("sphere_60", "red_sphere", 60, declared, declared),
         ("air", "air", 180, off, declared),
         ("mosaic", "red_sphere", 35, mosaic, mosaic),
     ):
         bench = SimulatedBench(scenes[scene], true, 662, rows=24, columns=32, seed=1, flux_e_per_s=5e5)
-        states = 1 if said.mosaic else 40
-        write_virtual_capture(folder / f"{name}.h5", bench, said, omega, states=states, darks=2, name=scene)
+        states = 1 if model.mosaic else 40
+        write_virtual_capture(folder / f"{name}.h5", bench, model, omega, states=states, darks=2, name=scene)
     with h5py.File(folder / "air.h5", "r+") as h5:
         header = json.loads(h5["entry"].attrs["header_json"]) | {"sample": {"kind": "air", "name": "air"}}
         h5["entry"].attrs["header_json"] = json.dumps(header)
@@ -73,8 +73,8 @@ def test_every_public_function_describes_what_it_takes_and_returns():
         for name in filter(lambda name: inspect.isfunction(getattr(package, name)), package.__all__):
             function = inspect.unwrap(getattr(package, name))
             text, signature = inspect.getdoc(function), inspect.signature(function)
-            taken = re.search(r"Parameters\n-+\n(.*?)(?:\n\n|$)", text, re.DOTALL)
-            described = re.findall(r"^[\w, ]+", taken[1] if taken else "", re.MULTILINE)
+            parameters = re.search(r"Parameters\n-+\n(.*?)(?:\n\n|$)", text, re.DOTALL)
+            described = re.findall(r"^[\w, ]+", parameters[1] if parameters else "", re.MULTILINE)
             words = {word.strip() for line in described for word in line.split(",")}
             wrong += [f"{name}: {parameter}" for parameter in signature.parameters if parameter not in words]
             wrong += [name] if signature.return_annotation not in (None, "None") and "Returns\n---" not in text else []
@@ -82,14 +82,14 @@ def test_every_public_function_describes_what_it_takes_and_returns():
 
 
 @pytest.mark.parametrize("name", WITH_EXAMPLES)
-def test_examples_print_what_they_say(name, made, tmp_path, monkeypatch):
+def test_examples_print_what_they_say(name, captures, tmp_path, monkeypatch):
     module = importlib.import_module(name)
     public = {public: getattr(processing, public) for public in processing.__all__}
-    found = doctest.DocTestFinder().find(module, extraglobs=public | {"Path": Path})
-    said: list[str] = []
+    examples = doctest.DocTestFinder().find(module, extraglobs=public | {"Path": Path})
+    output: list[str] = []
     runner = doctest.DocTestRunner(verbose=False)
-    for number, example in enumerate(found):
-        monkeypatch.chdir(shutil.copytree(made, tmp_path / str(number)))
-        runner.run(example, out=said.append)
+    for number, example in enumerate(examples):
+        monkeypatch.chdir(shutil.copytree(captures, tmp_path / str(number)))
+        runner.run(example, out=output.append)
     assert runner.tries > 0
-    assert not runner.failures, "".join(said)
+    assert not runner.failures, "".join(output)

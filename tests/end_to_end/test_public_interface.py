@@ -88,18 +88,18 @@ def test_a_campaign_is_one_array_over_angle_and_wavelength(capture, tmp_path):
     folder.mkdir()
     first = umov.Reduction(capture).make(folder / "a.h5")
     shutil.copy(first, folder / "b.h5")
-    other = umov.open_dataset(capture)
-    other.attrs["header"] = other.attrs["header"].replace('"omega_deg":35.0', '"omega_deg":50.0')
-    umov.Reduction(umov.write_dataset(other, tmp_path / "at_50.h5")).make(folder / "c.h5")
+    changed = umov.open_dataset(capture)
+    changed.attrs["header"] = changed.attrs["header"].replace('"omega_deg":35.0', '"omega_deg":50.0')
+    umov.Reduction(umov.write_dataset(changed, tmp_path / "at_50.h5")).make(folder / "c.h5")
     stack = umov.open_campaign(folder)
     assert stack.mueller.dims == ("sample", "wavelength", "omega", "repeat", "row", "column", "y", "x")
     assert stack.omega.values.tolist() == [35, 50]
     assert stack.sizes["repeat"] == 2
-    whole = umov.open_dataset(first).mueller.values
+    image = umov.open_dataset(first).mueller.values
     at_35 = stack.mueller.sel(omega=35, wavelength=662).isel(sample=0, repeat=1)
-    np.testing.assert_array_equal(at_35.values, whole)
+    np.testing.assert_array_equal(at_35.values, image)
     region = stack.mueller.isel(y=slice(20, 30), x=[3, 5, 40], repeat=0, sample=0, wavelength=0).sel(row=1, column=1)
-    np.testing.assert_array_equal(region.values[0], whole[1, 1, 20:30][:, [3, 5, 40]])
+    np.testing.assert_array_equal(region.values[0], image[1, 1, 20:30][:, [3, 5, 40]])
     # The second repeat was measured at one angle only.
     assert np.isnan(stack.mueller.sel(omega=50).isel(repeat=1, row=0, column=0, y=7).values).all()
     with pytest.raises(ProcessError, match="no product of kind 'stokes'"):

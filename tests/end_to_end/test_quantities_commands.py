@@ -22,8 +22,8 @@ Run = Callable[..., tuple[int, str, str]]
 def truth() -> np.ndarray:
     """One matrix, a depolarized diattenuating retarder that is not triply degenerate, m00 = 1."""
     m0 = mueller.retarder(0.5, 1.1) @ mueller.diattenuator(0.9, 1.0, 0.4) / 0.7
-    other = mueller.polarizer(1.2) * 2
-    return 0.9 * mueller_matrix(m0, 0.7) + 0.1 * other
+    second = mueller.polarizer(1.2) * 2
+    return 0.9 * mueller_matrix(m0, 0.7) + 0.1 * second
 
 
 @pytest.fixture

@@ -49,13 +49,13 @@ def test_bench_has_its_faults_in_every_capture_and_its_truth_apart(bench):
     folder, truth = bench
     assert 6 <= len({f.kind for f in truth.faults}) <= 10
     assert next(read_truth(folder)) == truth
-    own = {f.capture for f in truth.faults if f.kind == "source_flicker"}
-    assert own == {"sphere", "flat", "air"}
+    captures = {f.capture for f in truth.faults if f.kind == "source_flicker"}
+    assert captures == {"sphere", "flat", "air"}
     assert len({str(f.parameters) for f in truth.faults if f.kind == "source_drift"}) == 3
     for path in (folder / truth.name).iterdir():
         with h5py.File(path) as h5:
-            told = h5["entry"].attrs["header_json"]
-        assert not any(f.kind in told for f in truth.faults)
+            header = h5["entry"].attrs["header_json"]
+        assert not any(f.kind in header for f in truth.faults)
 
 
 def test_intervals_hold_what_the_instrument_file_leaves_uncertain(bench, configs):
@@ -70,12 +70,12 @@ def test_intervals_hold_what_the_instrument_file_leaves_uncertain(bench, configs
     )
     error = SystematicError(directions=uncertain, rms_over_m00=0.1, wavelength_nm=truth.wavelength_nm)
     exact = np.load(away / "validation.npy").astype(float)
-    noise, both = (
+    noise, full = (
         coverage_of(away / "validation_noisy.h5", declared.model_copy(update={"systematic": s}), exact)
         for s in ((), (error,))
     )
-    assert both.patches > noise.patches + 0.05
-    assert both.pixels > noise.pixels
+    assert full.patches > noise.patches + 0.05
+    assert full.pixels > noise.pixels
 
 
 def test_same_seed_gives_the_same_bench(bench, tmp_path, configs):
@@ -132,15 +132,15 @@ def test_every_fault_changes_what_a_capture_file_says(group, kind, configs):
         bench = declared_bench(model, 662.0, 16, mosaic, electrons=15_000.0)
         truths = [fault(bench, np.random.default_rng(3), polarimeter.states) for fault in faults]
         light = expose(bench, TrueScene(np.random.default_rng(4)), angles)
-        told = angles
+        angles_in_file = angles
         for change in bench.recorded:
-            told = change(told)
-        return truths, digitize(bench, light, np.random.default_rng(5)), told, bench.declared
+            angles_in_file = change(angles_in_file)
+        return truths, digitize(bench, light, np.random.default_rng(5)), angles_in_file, bench.declared
 
     (truth,), *changed = stored([GROUPS[group][kind]])
     assert truth.kind == kind
-    _, counts, told, declared = stored([])
-    same = [np.array_equal(counts, changed[0]), str(told) == str(changed[1]), declared == changed[2]]
+    _, counts, angles_in_file, declared = stored([])
+    same = [np.array_equal(counts, changed[0]), str(angles_in_file) == str(changed[1]), declared == changed[2]]
     assert not all(same)
 
 
@@ -154,9 +154,9 @@ def test_fit_of_the_truth_is_far_better_than_the_declared_instrument(bench, conf
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize(("group", "seed", "given"), [("none", 1, "joint"), ("real", 5, "sphere"), ("real", 7, "air")])
-def test_answer_to_a_small_bench_harms_nothing(group, seed, given, configs, tmp_path):
-    judgement, result = judge_bench(tmp_path, make_bench(tmp_path, seed, configs, group, pixels=SMALL), configs, given)
+@pytest.mark.parametrize(("group", "seed", "role"), [("none", 1, "joint"), ("real", 5, "sphere"), ("real", 7, "air")])
+def test_answer_to_a_small_bench_harms_nothing(group, seed, role, configs, tmp_path):
+    judgement, result = judge_bench(tmp_path, make_bench(tmp_path, seed, configs, group, pixels=SMALL), configs, role)
     assert not sure_and_wrong(judgement)
     assert not is_worse(judgement.declared, judgement.corrected)
     # A correction that is hardly better than none says so: it may lose.
@@ -178,10 +178,10 @@ BLIND = {
 @pytest.mark.long
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(
-    ("group", "given", "seed"), [(group, given, seed) for group, (given, seeds) in BLIND.items() for seed in seeds]
+    ("group", "role", "seed"), [(group, role, seed) for group, (role, seeds) in BLIND.items() for seed in seeds]
 )
-def test_one_undeclared_fault_gets_its_name_or_none(group, given, seed, configs, tmp_path):
-    judgement, _ = judge_bench(tmp_path, make_bench(tmp_path, seed, configs, group, pixels=SMALL), configs, given)
+def test_one_undeclared_fault_gets_its_name_or_none(group, role, seed, configs, tmp_path):
+    judgement, _ = judge_bench(tmp_path, make_bench(tmp_path, seed, configs, group, pixels=SMALL), configs, role)
     assert not sure_and_wrong(judgement)
     assert not is_worse(judgement.declared, judgement.corrected)
     if group == "single":

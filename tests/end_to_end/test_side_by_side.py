@@ -32,8 +32,8 @@ def _frame(rig: Rig, exposure_s: float):
 
 def test_two_simulated_rigs_measure_at_once(small_rig, second_address):
     configs = [load_rig(small_rig(f"{k}.yaml", seed=k, rows=24 + 8 * k, columns=32)) for k in (0, 1)]
-    with open_rig(configs[0]) as one, open_rig(configs[1]) as other:
-        shapes = [_frame(rig, 0.002).shape for rig in (one, other, one)]
+    with open_rig(configs[0]) as first, open_rig(configs[1]) as second:
+        shapes = [_frame(rig, 0.002).shape for rig in (first, second, first)]
     assert shapes == [(24, 32), (32, 32), (24, 32)]
 
 
