@@ -60,12 +60,12 @@ MOMENTS = ("exposing", "state_done")
 
 def run(options: list[object], end: str = "", moment: str = "", number: int = 0) -> dict[str, Any]:
     """`acquire` in a child that ends at the n-th such moment; what it reported, said and left switched on."""
-    with tempfile.TemporaryFile("w+") as said:
+    with tempfile.TemporaryFile("w+") as output:
         reader, writer = os.pipe()
         child = os.fork()
         if child == 0:
-            os.dup2(said.fileno(), 1)
-            os.dup2(said.fileno(), 2)
+            os.dup2(output.fileno(), 1)
+            os.dup2(output.fileno(), 2)
             code = 70
             rigs: list[SimulatedRig] = []
             _watch(end, moment, number, rigs=rigs, tell=lambda state: os.write(writer, f"{state}\n".encode()))
@@ -81,8 +81,8 @@ def run(options: list[object], end: str = "", moment: str = "", number: int = 0)
             lines = [json.loads(line) for line in pipe]
         status = os.waitpid(child, 0)[1]
         wait_for_orphans()
-        said.seek(0)
-        words = said.read()
+        output.seek(0)
+        words = output.read()
     light = lines.pop()["light"] if lines and isinstance(lines[-1], dict) else []
     return {"code": os.waitstatus_to_exitcode(status), "reported": lines, "light": light, "said": words}
 
@@ -94,10 +94,10 @@ def _watch(end: str, moment: str, number: int, *, rigs: list[SimulatedRig], tell
     def watched(name: str) -> Callable[..., None]:
         inner = getattr(ConsoleProgress, name)
 
-        def hear(progress: ConsoleProgress, *what: Any) -> None:
-            inner(progress, *what)
+        def hear(progress: ConsoleProgress, *details: Any) -> None:
+            inner(progress, *details)
             if name == "state_done":
-                tell(what[0].state)
+                tell(details[0].state)
             if name == moment and next(calls) == number:
                 ENDS[end]()
 
@@ -150,8 +150,8 @@ class LifeOfACapture(RuleBasedStateMachine):
         self.kind = (states, darks)
         if self.kind not in self.undisturbed:
             self._acquire(folder="whole")
-            (whole,) = (self.folder / "whole").glob("*.h5")
-            self.undisturbed[self.kind] = content(whole)
+            (complete,) = (self.folder / "whole").glob("*.h5")
+            self.undisturbed[self.kind] = content(complete)
 
     def _acquire(self, end: str = "", moment: str = "", number: int = 0, folder: str = "out") -> dict[str, Any]:
         first = ["--plan", self.folder / "plan.yaml", "--out", self.folder / folder]
@@ -194,10 +194,10 @@ class LifeOfACapture(RuleBasedStateMachine):
             }
             run_of = dict(zip(done, capture.column("segment"), strict=True))
             runs = len(capture.segments)
-            taken = [state for segment in capture.segments for state in segment.states]
+            states = [state for segment in capture.segments for state in segment.states]
         assert {state: now.get(state) for state in self.known} == self.known
         assert len(self.reported - now.keys()) <= lost, (self.reported, done)
-        assert len(set(taken)) == len(taken), taken
+        assert len(set(states)) == len(states), states
         assert {run_of[state] for state in now.keys() - self.known.keys()} <= {runs - 1}
         self.known, self.reported = now, set(now)
 
@@ -208,16 +208,16 @@ class LifeOfACapture(RuleBasedStateMachine):
         # Where no state is missing, the file is sealed on any rig.
         if not self.partial or not self.missing:
             return
-        made = zaber.ZaberDevice
+        device_class = zaber.ZaberDevice
 
         def other(*arguments: Any, serial_number: int, **options: Any) -> zaber.ZaberDevice:
-            return made(*arguments, serial_number=serial_number + 1000, **options)
+            return device_class(*arguments, serial_number=serial_number + 1000, **options)
 
         zaber.ZaberDevice = other  # type: ignore[misc,assignment]
         try:
             self._refused("psa.serial_number: 110002 at the start, 111002 now", code=2)
         finally:
-            zaber.ZaberDevice = made  # type: ignore[misc]
+            zaber.ZaberDevice = device_class  # type: ignore[misc]
 
     def _refused(self, words: str, code: int) -> None:
         assert self.file is not None

@@ -61,9 +61,9 @@ def partial_of() -> Callable[..., Path]:
 
     def wait(folder: Path, child: subprocess.Popen, states: int = 0) -> Path:
         while True:
-            found = list(folder.glob("*.partial"))
-            if found and (states == 0 or _states_done(found[0]) >= states):
-                return found[0]
+            partials = list(folder.glob("*.partial"))
+            if partials and (states == 0 or _states_done(partials[0]) >= states):
+                return partials[0]
             if child.poll() is not None:
                 raise AssertionError(f"the run ended early: {child.communicate()}")
             time.sleep(0.01)
@@ -85,19 +85,19 @@ def content() -> Callable[[Path], dict[str, object]]:
     """Everything in a capture but times."""
 
     def read(path: Path) -> dict[str, object]:
-        found: dict[str, object] = {}
+        items: dict[str, object] = {}
 
         def visit(name: str, node: h5py.Group | h5py.Dataset) -> None:
             for key in node.attrs.keys() - LINKS:
                 value = node.attrs[key]
-                found[f"{name}@{key}"] = value if np.isscalar(value) else np.asarray(value).tolist()
+                items[f"{name}@{key}"] = value if np.isscalar(value) else np.asarray(value).tolist()
             if isinstance(node, h5py.Dataset) and not any(name.endswith(time) for time in TIMES):
-                found[name] = node[...].tobytes() if node.dtype.kind != "O" else np.asarray(node[()]).tolist()
+                items[name] = node[...].tobytes() if node.dtype.kind != "O" else np.asarray(node[()]).tolist()
 
         with h5py.File(path) as file:
             visit("entry", file["entry"])
             file["entry"].visititems(visit)
-        return found
+        return items
 
     return read
 
@@ -201,33 +201,33 @@ def refused(tmp_path):
 
 
 @pytest.fixture
-def told(refused, capfd):
+def error_text(refused, capfd):
     """Runs a command that refuses its input; returns what it says, in lines that can be read."""
 
     def run(main, *arguments):
         refused(main, *arguments)
-        said = capfd.readouterr().err
-        assert "Traceback" not in said
-        assert all(len(line) < 1000 for line in said.splitlines())
-        return said
+        err = capfd.readouterr().err
+        assert "Traceback" not in err
+        assert all(len(line) < 1000 for line in err.splitlines())
+        return err
 
     return run
 
 
 @pytest.fixture
-def acquire_refuses(told):
+def acquire_refuses(error_text):
     from acquisition.commands.application import main
 
-    return partial(told, main)
+    return partial(error_text, main)
 
 
 @pytest.fixture
-def process_refuses(told):
+def process_refuses(error_text):
     from processing.commands.application import main
 
     def run(*arguments):
-        said = told(main, *arguments)
-        assert len(said.splitlines()) == 1, said
-        return said
+        err = error_text(main, *arguments)
+        assert len(err.splitlines()) == 1, err
+        return err
 
     return run

@@ -175,13 +175,13 @@ def take(kind: str, seed: int, folder: Path) -> tuple[bool, bool, bool, bool]:
             session.take(job, rig, path, StopRequest(), observers=[false])
         except (AcquisitionError, DeviceError) as caught:
             error = caught
-    found = next(file for file in folder.glob("run.h5*") if file.suffix != ".png")
-    with Capture(found) as capture:
-        told = [text for text in capture.closing.get("messages", []) if "false frame" in text]
+    result = next(file for file in folder.glob("run.h5*") if file.suffix != ".png")
+    with Capture(result) as capture:
+        messages = [text for text in capture.closing.get("messages", []) if "false frame" in text]
         warned = bool(capture.closing.get("evidence"))
         if error is None:
             warned = any("state" in text for text in CountCorrection.of(capture).warnings)
-    return error is not None, false.retakes > 0, bool(told), warned
+    return error is not None, false.retakes > 0, bool(messages), warned
 
 
 def main() -> int:
@@ -196,10 +196,10 @@ def main() -> int:
         for seed in range(each):
             with tempfile.TemporaryDirectory() as folder:
                 rows.append(take(kind, seed, Path(folder)))
-        ended, again, told, warned = (sum(column) for column in zip(*rows, strict=True))
+        ended, again, reports, warned = (sum(column) for column in zip(*rows, strict=True))
         passed = sum(not any(row) for row in rows)
         passed_of_first += passed if number < 10 else 0
-        print(f"{kind:<42} {each:>8} {ended:>6} {again:>6} {told:>8} {warned:>7} {passed:>7}", flush=True)
+        print(f"{kind:<42} {each:>8} {ended:>6} {again:>6} {reports:>8} {warned:>7} {passed:>7}", flush=True)
     return int(passed_of_first > 0)
 
 

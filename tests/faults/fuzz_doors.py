@@ -57,15 +57,15 @@ def _serve(door: str, pipe: Connection) -> None:
         start_s = time.process_time()
         try:
             nonsense = DOORS[door].read(path)
-            found = ("nonsense", nonsense) if nonsense else ("accepted", "")
+            outcome = ("nonsense", nonsense) if nonsense else ("accepted", "")
         except ProcessError as error:
             lines = str(error).splitlines()
             readable = lines and max(map(len, lines)) <= LONGEST_LINE and len(lines) <= 31
-            found = ("refused", str(error)) if readable else ("traceback", f"unreadable: {str(error)[:300]!r}")
+            outcome = ("refused", str(error)) if readable else ("traceback", f"unreadable: {str(error)[:300]!r}")
         except BaseException:  # noqa: BLE001 - whatever came is what is counted
-            found = ("traceback", traceback.format_exc())
+            outcome = ("traceback", traceback.format_exc())
         spent_s = time.process_time() - start_s
-        pipe.send(found if spent_s < PROCESSOR_S else ("hang", f"{spent_s:.1f} s: {found}"))
+        pipe.send(outcome if spent_s < PROCESSOR_S else ("hang", f"{spent_s:.1f} s: {outcome}"))
 
 
 class Reader:
@@ -78,13 +78,13 @@ class Reader:
     def read(self, path: Path) -> tuple[str, str]:
         """What came of a file, and the words."""
         if self._process is None:
-            self._pipe, other = multiprocessing.Pipe()
+            self._pipe, child_end = multiprocessing.Pipe()
             # What is loaded here is loaded there.
             self._process = multiprocessing.get_context("fork").Process(
-                target=_serve, args=(self._door, other), daemon=True
+                target=_serve, args=(self._door, child_end), daemon=True
             )
             self._process.start()
-            other.close()
+            child_end.close()
         try:
             self._pipe.send(path)
             if self._pipe.poll(WAIT_S):
@@ -106,33 +106,33 @@ class Reader:
 
 def fuzz(name: str, seed: int, inputs: int | None, seconds: float | None, keep: Path | None) -> Counter[str]:
     """Spoil sound files and read them, for so many inputs or seconds; prints what must not be."""
-    door, rng, found = DOORS[name], random.Random(f"{seed} {name}"), Counter[str]()
+    door, rng, outcomes = DOORS[name], random.Random(f"{seed} {name}"), Counter[str]()
     end_s = time.monotonic() + (seconds or 1e9)
     reader = Reader(name)
     with tempfile.TemporaryDirectory() as folder:
         sources = door.make(Path(folder))
         for source in sources:
-            what, words = reader.read(source)
-            if what != "accepted" and name != "tensor":
+            outcome, words = reader.read(source)
+            if outcome != "accepted" and name != "tensor":
                 raise SystemExit(f"{name}: the sound file {source.name} was not accepted: {words}")
-        while found.total() < (inputs or 1 << 60) and time.monotonic() < end_s:
+        while outcomes.total() < (inputs or 1 << 60) and time.monotonic() < end_s:
             path = fresh(rng.choice(sources), Path(folder))
             if rng.randrange(IMPOSTORS) == 0:
                 put_impostor(rng, path)
             else:
                 door.spoil(rng, path)
-            what, words = reader.read(path)
+            outcome, words = reader.read(path)
             if TRAP.exists():
-                what, words = "obeyed", f"{TRAP} was made"
+                outcome, words = "obeyed", f"{TRAP} was made"
                 TRAP.unlink()
-            found[what] += 1
-            if what in BAD:
-                print(f"{name} input {found.total()}: {what}: {words}", flush=True)
+            outcomes[outcome] += 1
+            if outcome in BAD:
+                print(f"{name} input {outcomes.total()}: {outcome}: {words}", flush=True)
                 if keep is not None and path.is_file():
                     keep.mkdir(parents=True, exist_ok=True)
-                    shutil.copy(path, keep / f"{name}_{seed}_{found.total()}_{path.name}")
+                    shutil.copy(path, keep / f"{name}_{seed}_{outcomes.total()}_{path.name}")
     reader.close()
-    return found
+    return outcomes
 
 
 def main() -> int:
@@ -147,20 +147,20 @@ def main() -> int:
     options = parser.parse_args()
     inputs = options.inputs or (None if options.seconds else 120)
     total: Counter[str] = Counter()
-    print(f"{'door':<11} {'inputs':>7} {'refused':>8} {'accepted':>9} " + " ".join(f"{what:>9}" for what in BAD))
+    print(f"{'door':<11} {'inputs':>7} {'refused':>8} {'accepted':>9} " + " ".join(f"{outcome:>9}" for outcome in BAD))
     names = list(DOORS) if options.door == "all" else [options.door]
-    one = partial(fuzz, seed=options.seed, inputs=inputs, seconds=options.seconds, keep=options.keep)
+    fuzz_door = partial(fuzz, seed=options.seed, inputs=inputs, seconds=options.seconds, keep=options.keep)
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("fork")) as pool:
-        for name, found in zip(names, pool.map(one, names), strict=True):
-            total += found
-            _print(name, found)
+        for name, outcomes in zip(names, pool.map(fuzz_door, names), strict=True):
+            total += outcomes
+            _print(name, outcomes)
     _print("all", total)
-    return int(any(total[what] for what in BAD))
+    return int(any(total[outcome] for outcome in BAD))
 
 
-def _print(name: str, found: Counter[str]) -> None:
-    bad = " ".join(f"{found[what]:>9}" for what in BAD)
-    print(f"{name:<11} {found.total():>7} {found['refused']:>8} {found['accepted']:>9} {bad}", flush=True)
+def _print(name: str, outcomes: Counter[str]) -> None:
+    bad = " ".join(f"{outcomes[outcome]:>9}" for outcome in BAD)
+    print(f"{name:<11} {outcomes.total():>7} {outcomes['refused']:>8} {outcomes['accepted']:>9} {bad}", flush=True)
 
 
 if __name__ == "__main__":

@@ -86,14 +86,14 @@ def _spoil_h5(rng: random.Random, path: Path) -> None:
 
 def _yaml_door(*folders: str, read: Callable[[Path], str | None]) -> Door:
     def make(folder: Path) -> Sequence[Path]:
-        made = []
+        paths = []
         for name in folders:
             for path in sorted((CONFIGS / name).glob("*.yaml")):
-                made.append(folder / path.name)
+                paths.append(folder / path.name)
                 # Paths in them are relative to the file.
                 text = path.read_text().replace("../", f"{CONFIGS}/")
-                made[-1].write_text(text.replace("file: ", f"file: {CONFIGS}/{name}/"))
-        return made
+                paths[-1].write_text(text.replace("file: ", f"file: {CONFIGS}/{name}/"))
+        return paths
 
     return Door(make, _spoil_yaml, read)
 
@@ -374,8 +374,8 @@ def _index(path: Path) -> str | None:
     index = path.with_name("index.json")
     # What was spoilt itself, which may be a link or a pipe; the sound one is read again.
     shutil.copy(path, index) if path.name == "sound.json" else path.rename(index)
-    found = read_index(path.parent)
-    return None if all(isinstance(entry, dict) for entry in found.values()) else "an entry that is none"
+    entries = read_index(path.parent)
+    return None if all(isinstance(entry, dict) for entry in entries.values()) else "an entry that is none"
 
 
 DOORS: dict[str, Door] = {

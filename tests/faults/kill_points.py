@@ -90,8 +90,8 @@ def run(options: list[str], out: Path, before: Callable[[DiscCalls], None] = lam
     status = os.waitpid(child, 0)[1]
     wait_for_orphans()
     with os.fdopen(reader) as pipe:
-        made = pipe.read()
-    return status, int(made or 0)
+        count = pipe.read()
+    return status, int(count or 0)
 
 
 def wait_for_orphans() -> None:
@@ -103,17 +103,17 @@ def wait_for_orphans() -> None:
 
 def content(capture: Path) -> dict[str, bytes]:
     """Digests of everything in a capture but times."""
-    found: dict[str, bytes] = {}
+    digests: dict[str, bytes] = {}
 
     def visit(name: str, node: h5py.Group | h5py.Dataset) -> None:
         if isinstance(node, h5py.Dataset) and not name.endswith(TIMES):
             value = np.asarray(node[()])
             raw = str(value).encode() if value.dtype == object else value.tobytes()
-            found[name] = hashlib.blake2b(raw).digest()
+            digests[name] = hashlib.blake2b(raw).digest()
 
     with h5py.File(capture) as h5:
         h5.visititems(visit)
-    return found
+    return digests
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -125,11 +125,11 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
-def check(out: Path, whole: dict[str, bytes]) -> str:
+def check(out: Path, expected: dict[str, bytes]) -> str:
     """What is wrong with a campaign that came to its end, or nothing."""
     wrong = [f"{f.title}: {f.detail}" for f in verify(out / "night") if f.well is not True]
-    there = contents(out)
-    differing = sorted(name for name in {*whole, *there} if whole.get(name) != there.get(name))
+    result = contents(out)
+    differing = sorted(name for name in {*expected, *result} if expected.get(name) != result.get(name))
     if differing:
         wrong.append(f"differs from an undisturbed run in {differing[:5]}")
     return "; ".join(wrong)
@@ -140,7 +140,7 @@ def kill(options: list[str], every: int, first: int, fails: bool) -> int:
     captures = WORK / "captures"
     status, total = run(options, captures / "whole", lambda calls: calls.arm(0))
     assert status == 0, status
-    whole = contents(captures / "whole")
+    expected = contents(captures / "whole")
     lost = points = 0
     begin_s = time.monotonic()
     for number in range(first, total + 1, every):
@@ -154,14 +154,14 @@ def kill(options: list[str], every: int, first: int, fails: bool) -> int:
         killed = status != 0
         crashed = "" if not fails or not os.WIFSIGNALED(status) else f"crashed with signal {os.WTERMSIG(status)}"
         status, _ = run(options, out)
-        wrong = crashed or (check(out, whole) if status == 0 else f"going on ended with {status}")
+        wrong = crashed or (check(out, expected) if status == 0 else f"going on ended with {status}")
         points += killed
         if wrong:
             lost += 1
             print(f"call {number}: {wrong}", flush=True)
         shutil.rmtree(out)
-    what = "errors told" if fails else "kill points"
-    print(f"{points} {what} of {total} calls, {lost} with something lost, {time.monotonic() - begin_s:.0f} s")
+    kind = "errors told" if fails else "kill points"
+    print(f"{points} {kind} of {total} calls, {lost} with something lost, {time.monotonic() - begin_s:.0f} s")
     return lost
 
 
@@ -172,7 +172,7 @@ def night(options: list[str], captures: int, calls: int, seed: int = 1) -> int:
     """
     status, _ = run(options, WORK / "captures" / "whole", lambda armed: armed.arm(0))
     assert status == 0, status
-    out, chance, known = WORK / "captures" / "night", random.Random(f"{seed}{GO_ON}"), _Known()
+    out, chance, record = WORK / "captures" / "night", random.Random(f"{seed}{GO_ON}"), _Known()
     begin_s, kills, errors, ended, wrong = time.monotonic(), 0, 0, 0, list[str]()
     while True:
         number, failing = chance.randint(1, 2 * calls), 0
@@ -181,23 +181,23 @@ def night(options: list[str], captures: int, calls: int, seed: int = 1) -> int:
         if time.monotonic() - begin_s > LIMIT_S:
             number = failing = 0
         status, _ = run(options, out, lambda armed, at=(number, failing): armed.arm(at[0], failing=at[1]))
-        wrong += known.lost(out / "night")
+        wrong += record.lost(out / "night")
         killed = os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
         # Exit code 1 is a failure that was told: of a call that was to fail, or of a machine too busy for a device.
-        told = not killed and os.waitstatus_to_exitcode(status) == 1
-        ended += told and not failing
-        if not (killed or told) or ended > MOST_ENDED:
+        has_ended = not killed and os.waitstatus_to_exitcode(status) == 1
+        ended += has_ended and not failing
+        if not (killed or has_ended) or ended > MOST_ENDED:
             break
         kills, errors = kills + killed, errors + (failing > 0)
         if kills % 50 == 0:
             passed_s = time.monotonic() - begin_s
-            print(f"{kills} kills, {errors} failing calls, {known.states()} states, {passed_s:.0f} s", flush=True)
+            print(f"{kills} kills, {errors} failing calls, {record.states()} states, {passed_s:.0f} s", flush=True)
     wrong += filter(None, [check(out, contents(WORK / "captures" / "whole"))])
     complete = len(list((out / "night").glob("*.h5")))
     code = os.waitstatus_to_exitcode(status)
     print(
         f"{kills} kills, {errors} failing calls, {ended} ended by themselves, last exit code {code}, {complete} of "
-        f"{captures} captures complete, {known.states()} states, {len(wrong)} findings, "
+        f"{captures} captures complete, {record.states()} states, {len(wrong)} findings, "
         f"{time.monotonic() - begin_s:.0f} s"
     )
     print("\n".join(wrong[:10]))
@@ -235,10 +235,10 @@ class _Reported:
     def __init__(self, calls: DiscCalls) -> None:
         from acquisition.screen.progress import ConsoleProgress
 
-        told = ConsoleProgress.state_done
+        inner = ConsoleProgress.state_done
 
         def state_done(progress: ConsoleProgress, report: object) -> None:
-            told(progress, report)  # type: ignore[arg-type]
+            inner(progress, report)  # type: ignore[arg-type]
             calls.note("state")
 
         ConsoleProgress.state_done = state_done  # type: ignore[method-assign,assignment]
@@ -265,8 +265,8 @@ def power(options: list[str], cuts: int, seed: int = 1) -> int:
             disc.apply(call)
             reported += call.kind == "note"
         done = end
-        for kept in (None, random.Random(chance.random())):
-            files = disc.after_power_cut(kept)
+        for cache in (None, random.Random(chance.random())):
+            files = disc.after_power_cut(cache)
             # Between two syncs the disc is sure of the same files.
             key = hash(frozenset(files.items()))
             if key not in looked:
@@ -277,12 +277,14 @@ def power(options: list[str], cuts: int, seed: int = 1) -> int:
                     file.parent.mkdir(parents=True, exist_ok=True)
                     file.write_bytes(raw)
                 looked[key] = _left(target / "night")
-            there, unreadable = looked[key]
+            states_on_disc, unreadable = looked[key]
             opened += 1
-            worst = max(worst, reported - there)
-            if reported - there > 1 or unreadable:
+            worst = max(worst, reported - states_on_disc)
+            if reported - states_on_disc > 1 or unreadable:
                 lost += 1
-                print(f"cut at call {end}: {reported} states reported, {there} there; {unreadable}", flush=True)
+                print(
+                    f"cut at call {end}: {reported} states reported, {states_on_disc} there; {unreadable}", flush=True
+                )
     print(f"{opened} power cuts at {len(calls)} calls: at most {worst} reported states lost, {lost} beyond the bound")
     return lost
 
@@ -340,14 +342,14 @@ def image(options: list[str], cuts: int, seed: int = 1) -> int:
         copy.mkdir(exist_ok=True)
         subprocess.run(["mount", "-o", "loop", WORK / "copy.img", copy], check=True)
         try:
-            there, unreadable = _left(copy / "run" / "night")
+            states_on_disc, unreadable = _left(copy / "run" / "night")
         finally:
             subprocess.run(["umount", copy], check=True)
         reported = sum(call.kind == "note" for call in read_record(log)) if log.exists() else 0
-        worst = max(worst, reported - there)
-        if reported - there > 1 or unreadable:
+        worst = max(worst, reported - states_on_disc)
+        if reported - states_on_disc > 1 or unreadable:
             lost += 1
-            print(f"cut at call {number}: {reported} reported, {there} there; {unreadable}", flush=True)
+            print(f"cut at call {number}: {reported} reported, {states_on_disc} there; {unreadable}", flush=True)
     print(f"{len(chosen)} copies of the block device: at most {worst} reported states lost, {lost} beyond the bound")
     return lost
 
@@ -364,7 +366,7 @@ def _fresh_device(device: Path, mount: Path) -> None:
 
 def main() -> None:
     """Run one of the five."""
-    which, numbers = sys.argv[1], [int(text) for text in sys.argv[2:]]
+    mode, numbers = sys.argv[1], [int(text) for text in sys.argv[2:]]
     if "LD_PRELOAD" not in os.environ:
         # Two at once would read each other's records. The lock goes on into the program that takes this one's place.
         lock = os.open(f"{WORK}.lock", os.O_CREAT | os.O_RDWR, 0o600)
@@ -378,9 +380,9 @@ def main() -> None:
         (WORK / "captures").mkdir(parents=True, exist_ok=True)
         restart_watched(build(WORK), WORK / "captures")
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)
-    captures = (numbers or [300])[0] if which == "night" else 1
+    captures = (numbers or [300])[0] if mode == "night" else 1
     options = write_files(WORK, captures)
-    every, first = [*numbers, *(1, 1)[len(numbers) :]][:2] if which in ("kill", "error") else (1, 1)
+    every, first = [*numbers, *(1, 1)[len(numbers) :]][:2] if mode in ("kill", "error") else (1, 1)
     work: dict[str, Callable[[], int]] = {
         "kill": lambda: kill(options, every, first, fails=False),
         "error": lambda: kill(options, every, first, fails=True),
@@ -388,7 +390,7 @@ def main() -> None:
         "image": lambda: image(options, (numbers or [200])[0]),
         "night": lambda: night(options, captures, numbers[1] if len(numbers) > 1 else 45),
     }
-    sys.exit(1 if work[which]() else 0)
+    sys.exit(1 if work[mode]() else 0)
 
 
 if __name__ == "__main__":

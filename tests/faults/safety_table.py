@@ -102,25 +102,25 @@ class Run:
             )
 
     def guards(self) -> list[int]:
-        found = []
+        pids = []
         for status in Path("/proc").glob("[0-9]*/stat"):
             with contextlib.suppress(OSError):
                 parent = int(status.read_text().rpartition(")")[2].split()[1])
                 if parent == self.child.pid and b"acquisition.rig.guard" in (status.parent / "cmdline").read_bytes():
-                    found.append(int(status.parent.name))
-        return found
+                    pids.append(int(status.parent.name))
+        return pids
 
     def inject(self, fault: str, discs: Discs, guards: list[int]) -> None:
-        who, _, what = fault.partition(" ")
+        who, _, action = fault.partition(" ")
         pids = [self.child.pid] if who == "acquire" else (guards or self.guards())
         if who == "disc":
             discs.hang()
         for pid in pids if who != "disc" else []:
             with contextlib.suppress(ProcessLookupError):
-                if what == "starved":
+                if action == "starved":
                     threading.Thread(target=self._starve, args=(pid,), daemon=True).start()
-                elif what != "missing":
-                    os.kill(pid, signal.SIGKILL if what == "killed" else signal.SIGSTOP)
+                elif action != "missing":
+                    os.kill(pid, signal.SIGKILL if action == "killed" else signal.SIGSTOP)
 
     def _starve(self, pid: int) -> None:
         """A hundredth of the time for each second: a machine that has next to none for it."""
@@ -153,17 +153,17 @@ class Run:
         time.sleep(0.3)
         self.child.kill()
         self.child.wait()
-        said = self.errors.read_text() + (work / "told.txt").read_text() if (work / "told.txt").exists() else ""
-        said += self.errors.read_text()
+        text = self.errors.read_text() + (work / "told.txt").read_text() if (work / "told.txt").exists() else ""
+        text += self.errors.read_text()
         end_s = time.monotonic() + 60
         while any(Path(f"/proc/{pid}").exists() for pid in (*guards, *late)) and time.monotonic() < end_s:
             for alarm in (work / "umov").glob("alarm-*.json"):
-                said += alarm.read_text()
+                text += alarm.read_text()
                 alarm.unlink(missing_ok=True)
             time.sleep(0.05)
         if (self.out / "guard.jsonl").exists():
-            said += (self.out / "guard.jsonl").read_text()
-        return said
+            text += (self.out / "guard.jsonl").read_text()
+        return text
 
 
 @contextlib.contextmanager
@@ -204,9 +204,9 @@ def once(number: int, faults: list[str], gap_s: float, discs: Discs, *, cutoff: 
                 if not reported and (reported := "guard" in run.errors.read_text()):
                     end_s = time.monotonic() + 10
                 time.sleep(0.01)
-            said = run.end([], work)
+            text = run.end([], work)
             shutil.rmtree(out, ignore_errors=True)
-            return {"dark_s": 99.0 if lit else 0.0, "reported": "guard" in said}
+            return {"dark_s": 99.0 if lit else 0.0, "reported": "guard" in text}
         while not simulation.light():
             if run.child.poll() is not None:
                 print(f"ended before there was light: {run.errors.read_text()[-300:]}", file=sys.stderr)
@@ -239,11 +239,11 @@ def once(number: int, faults: list[str], gap_s: float, discs: Discs, *, cutoff: 
             run.interrupted() if "disc hung" in faults and not any("acquire" in fault for fault in faults) else 0.0
         )
         discs.thaw()
-        said = run.end(list({*guards, *run.guards()}), work)
+        text = run.end(list({*guards, *run.guards()}), work)
         # The disc is small.
         shutil.rmtree(out, ignore_errors=True)
     words = ("guard", "acquire was", "acquire died", "disc", "LIGHT")
-    reported = any(word in said for word in words)
+    reported = any(word in text for word in words)
     return {"dark_s": 8.0 if dark_s is None else dark_s, "reported": reported, "ended_s": ended_s}
 
 
@@ -257,33 +257,33 @@ def main() -> None:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         discs = Discs(Path(name))
         try:
-            known = sys.argv[3:] or (SINGLE if discs.can_hang else SINGLE[1:])
+            choices = sys.argv[3:] or (SINGLE if discs.can_hang else SINGLE[1:])
             for number in range(runs):
-                faults = chance.sample(known, min(len(known), chance.choice([1, 2])))
+                faults = chance.sample(choices, min(len(choices), chance.choice([1, 2])))
                 if "guard missing" in faults:
                     faults = ["guard missing"]
                 gap_s, cutoff = chance.uniform(0, 3), chance.random() < 0.3
-                gone = {fault.split()[0] for fault in faults}
-                doomed = gone == {"acquire", "guard"} and gap_s < TOO_CLOSE_S and not cutoff
+                victims = {fault.split()[0] for fault in faults}
+                doomed = victims == {"acquire", "guard"} and gap_s < TOO_CLOSE_S and not cutoff
                 for _ in range(3):
-                    if (found := once(number, faults, gap_s, discs, cutoff=cutoff)) is not None:
+                    if (outcome := once(number, faults, gap_s, discs, cutoff=cutoff)) is not None:
                         break
                 else:
                     raise SystemExit("three runs in a row ended before there was light")
-                kind = "25 disc" if "disc" in gone else "26 guard" if "guard" in gone else "17 acquire"
+                kind = "25 disc" if "disc" in victims else "26 guard" if "guard" in victims else "17 acquire"
                 hardware = "relay" if cutoff else "both at once" if doomed else "none"
-                found |= {"faults": faults, "gap_s": round(gap_s, 2), "hardware": hardware, "number": number}
-                table[kind, " + ".join(sorted(faults)) + f", {hardware}"].append(found)
-                print(json.dumps(found), flush=True)
+                outcome |= {"faults": faults, "gap_s": round(gap_s, 2), "hardware": hardware, "number": number}
+                table[kind, " + ".join(sorted(faults)) + f", {hardware}"].append(outcome)
+                print(json.dumps(outcome), flush=True)
         finally:
             discs.close()
     print(f"\n{'promise':11s} {'fault':52s} {'runs':>4s} {'dark':>4s} {'worst s':>7s} {'reported':>8s} {'ended s':>8s}")
     for (promise, fault), found_runs in sorted(table.items()):
-        dark = [float(str(found["dark_s"])) for found in found_runs]
+        dark = [float(str(outcome["dark_s"])) for outcome in found_runs]
         print(
             f"{promise:11s} {fault:52s} {len(dark):4d} {sum(d <= LIMIT_S for d in dark):4d} {max(dark):7.2f} "
-            f"{sum(bool(found['reported']) for found in found_runs):8d} "
-            f"{max(float(str(found.get('ended_s', 0))) for found in found_runs):8.2f}"
+            f"{sum(bool(outcome['reported']) for outcome in found_runs):8d} "
+            f"{max(float(str(outcome.get('ended_s', 0))) for outcome in found_runs):8.2f}"
         )
 
 

@@ -29,8 +29,8 @@ def states(tmp_path):
     def write(change=lambda rows: None, files=True):
         change(rows)
         path = tmp_path / "states.csv"
-        kept = rows if files else [row[:-1] for row in rows]
-        path.write_text("\n".join(",".join(map(str, row)) for row in kept) + "\n")
+        columns = rows if files else [row[:-1] for row in rows]
+        path.write_text("\n".join(",".join(map(str, row)) for row in columns) + "\n")
         return path
 
     return write
@@ -104,9 +104,9 @@ def test_picture_that_promises_terabytes(states, tmp_path, process_refuses):
 
 
 def test_picture_cut_short(states, tmp_path, process_refuses):
-    whole = tmp_path / "f3.png"
-    cv2.imwrite(str(whole), np.random.default_rng(1).integers(0, 4000, (4, 6)).astype(np.uint16))
-    whole.write_bytes(whole.read_bytes()[:-30])
+    picture = tmp_path / "f3.png"
+    cv2.imwrite(str(picture), np.random.default_rng(1).integers(0, 4000, (4, 6)).astype(np.uint16))
+    picture.write_bytes(picture.read_bytes()[:-30])
     arguments = ("--states", states(), "--wavelength-nm", 662, "--instrument", INSTRUMENT)
     assert "f3.png" in process_refuses("import", *arguments)
 
@@ -152,8 +152,8 @@ def test_stack(states, tmp_path, process_refuses, name):
     path = tmp_path / ("stack.h5" if inside else "stack.npy")
     make(path)
     arguments = ("--states", states(files=False), "--wavelength-nm", 662, "--instrument", INSTRUMENT)
-    said = process_refuses("import", *arguments, "--stack", f"{path}{inside}")
-    assert re.search(word, said), said
+    err = process_refuses("import", *arguments, "--stack", f"{path}{inside}")
+    assert re.search(word, err), err
 
 
 def test_pbsdf_of_other_shapes(tmp_path):

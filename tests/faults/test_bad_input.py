@@ -54,9 +54,9 @@ def test_yaml(acquire_refuses, tmp_path, name):
     text, word = YAML_FILES[name]
     plan = tmp_path / "plan.yaml"
     plan.write_text(text)
-    said = acquire_refuses("--plan", plan, "--dry-run", "--out", tmp_path)
-    assert word in said, said
-    assert str(plan) in said
+    err = acquire_refuses("--plan", plan, "--dry-run", "--out", tmp_path)
+    assert word in err, err
+    assert str(plan) in err
 
 
 @pytest.mark.parametrize("text", [".nan", "nan", "'inf'", "1e999", "{.inf: 90}"])

@@ -76,11 +76,11 @@ def test_a_clock_that_is_set_in_mid_run_leaves_order_and_frames_right(run_with, 
 
 
 def test_a_machine_that_slept_takes_the_state_again(run_with, intact, monkeypatch):
-    clocks, seen = MachineClocks(monkeypatch), []
+    clocks, visits = MachineClocks(monkeypatch), []
 
     def sleep(rig, state, retake):
-        seen.append(state)
-        if seen.count(7) == 1 and state == 7:
+        visits.append(state)
+        if visits.count(7) == 1 and state == 7:
             # In the exposure that follows, not before it.
             trigger = rig.camera._do_trigger
 
@@ -93,7 +93,7 @@ def test_a_machine_that_slept_takes_the_state_again(run_with, intact, monkeypatc
 
     error, path = run_with(sleep, plan=SHORT, top={"retakes": 5})
     assert error is None
-    assert seen.count(7) > 1
+    assert visits.count(7) > 1
     assert intact(path) == 19
     assert "the machine slept for 600.0 s" in _messages(path)
     with Capture(path) as capture:

@@ -44,29 +44,29 @@ def test_a_record_that_fits_is_kept_whole(tmp_path):
 @pytest.mark.parametrize("character", ["ü", "光", "🔦", "\udcff"], ids=["2 bytes", "3 bytes", "4 bytes", "surrogate"])
 def test_messages_of_any_alphabet(tmp_path, character):
     messages = texts(character)
-    found = sealed(tmp_path, {"end_time": "now", "messages": messages, "ledger": {"moving_s": 1.5}})
-    kept, left_out = found["messages"], found.get("left_out", {}).get("messages", 0)
-    assert kept == messages[: len(kept)]
-    assert len(kept) + left_out == 200
-    assert len(kept) > 60
-    assert (found["end_time"], found["ledger"]) == ("now", {"moving_s": 1.5})
+    record = sealed(tmp_path, {"end_time": "now", "messages": messages, "ledger": {"moving_s": 1.5}})
+    stored, left_out = record["messages"], record.get("left_out", {}).get("messages", 0)
+    assert stored == messages[: len(stored)]
+    assert len(stored) + left_out == 200
+    assert len(stored) > 60
+    assert (record["end_time"], record["ledger"]) == ("now", {"moving_s": 1.5})
 
 
 def test_thousands_of_interlock_events_are_cut_and_told(tmp_path):
     events = [{"state": float(k), "why": "the light has drifted by +3.00 % since the pose before"} for k in range(4000)]
-    found = sealed(tmp_path, {"end_time": "now", "interlocks": events, "messages": ["one"]})
-    kept = found["interlocks"]
-    assert 2000 < len(kept) < 4000
-    assert kept == events[: len(kept)]
-    assert found["left_out"] == {"interlocks": 4000 - len(kept)}
-    assert found["messages"] == ["one"]
+    record = sealed(tmp_path, {"end_time": "now", "interlocks": events, "messages": ["one"]})
+    stored = record["interlocks"]
+    assert 2000 < len(stored) < 4000
+    assert stored == events[: len(stored)]
+    assert record["left_out"] == {"interlocks": 4000 - len(stored)}
+    assert record["messages"] == ["one"]
     page = write_report([tmp_path / "c.h5"], tmp_path / "r.html", "t").read_text()
-    assert f"left out: {4000 - len(kept)} of interlocks" in page
+    assert f"left out: {4000 - len(stored)} of interlocks" in page
 
 
 def test_one_endless_text_or_value_does_not_stop_the_seal(tmp_path):
-    found = sealed(tmp_path, {"failure": "x" * 10**6, "stream": {str(k): k for k in range(10**5)}, "status": "failed"})
-    assert found["failure"].startswith("xxx")
-    assert found["left_out"]["failure"] == 10**6 - len(found["failure"])
-    assert "stream" not in found
-    assert found["status"] == "failed"
+    record = sealed(tmp_path, {"failure": "x" * 10**6, "stream": {str(k): k for k in range(10**5)}, "status": "failed"})
+    assert record["failure"].startswith("xxx")
+    assert record["left_out"]["failure"] == 10**6 - len(record["failure"])
+    assert "stream" not in record
+    assert record["status"] == "failed"

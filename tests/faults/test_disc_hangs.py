@@ -26,9 +26,9 @@ def _children(pid):
 
 def _disc_process(pid):
     """The child that runs the same command line: it was forked, and no other program was begun in it."""
-    own = Path(f"/proc/{pid}/cmdline").read_bytes()
-    (found,) = [child for child in _children(pid) if Path(f"/proc/{child}/cmdline").read_bytes() == own]
-    return found
+    command = Path(f"/proc/{pid}/cmdline").read_bytes()
+    (writer,) = [child for child in _children(pid) if Path(f"/proc/{child}/cmdline").read_bytes() == command]
+    return writer
 
 
 def _command(pid):
@@ -56,13 +56,13 @@ def begun(small_rig, spawn, tmp_path, monkeypatch):
         child.wait()
         journal = out / "guard.jsonl"
         _wait_for(
-            lambda: "guard rests" in (said := journal.read_text()) or ("light shut" in said and "axes at rest" in said)
+            lambda: "guard rests" in (text := journal.read_text()) or ("light shut" in text and "axes at rest" in text)
         )
 
 
-def _wait_for(what, child=None, limit_s=60.0):
+def _wait_for(condition, child=None, limit_s=60.0):
     end_s = time.monotonic() + limit_s
-    while not what():
+    while not condition():
         assert time.monotonic() < end_s
         assert child is None or child.poll() is None, child.communicate()
         time.sleep(0.005)
@@ -81,12 +81,12 @@ def test_a_disc_that_hangs_shuts_the_light_and_lets_the_program_end(begun, parti
         child.send_signal(signal.SIGINT)
         time.sleep(0.2)
     begin_s = time.monotonic()
-    _, said = child.communicate(timeout=30)
+    _, err = child.communicate(timeout=30)
     assert time.monotonic() - begin_s < 10.0
-    assert child.returncode == 130, said
-    assert "the end of the run could not be recorded" in said
-    (kept,) = (tmp_path / "umov").glob("end-*.json")
-    assert json.loads(kept.read_text())["status"] == "aborted"
+    assert child.returncode == 130, err
+    assert "the end of the run could not be recorded" in err
+    (record,) = (tmp_path / "umov").glob("end-*.json")
+    assert json.loads(record.read_text())["status"] == "aborted"
     # What was done before is intact, and the file is free.
     _wait_for(lambda: not Path(f"/proc/{hung}").exists())
     with Capture(partial) as capture:
@@ -103,18 +103,18 @@ def test_the_process_that_measures_has_no_file_of_the_captures_open(begun, parti
     disc = _disc_process(child.pid)
     assert partial in _open_files(disc)
     # And the other one has no port of the rig.
-    others = [str(path) for path in _open_files(disc) if path != partial]
-    assert not [path for path in others if path.startswith("/dev/") and path != os.devnull]
-    assert len([path for path in others if path.startswith("socket")]) == 1
+    files = [str(path) for path in _open_files(disc) if path != partial]
+    assert not [path for path in files if path.startswith("/dev/") and path != os.devnull]
+    assert len([path for path in files if path.startswith("socket")]) == 1
 
 
 def test_a_capture_goes_on_in_a_new_run_when_the_disc_process_was_killed(begun, partial_of, acquire):
     simulation, child, out = begun
     partial_of(out, child, states=2)
     os.kill(_disc_process(child.pid), signal.SIGKILL)
-    _, said = child.communicate(timeout=60)
+    _, err = child.communicate(timeout=60)
     assert child.returncode == 1
-    assert "the process that writes the captures has ended" in said
+    assert "the process that writes the captures has ended" in err
     assert not simulation.light()
 
 
@@ -128,15 +128,15 @@ def test_stop_writes_nothing(acquire, small_rig, tmp_path, monkeypatch):
 
 
 def test_a_command_that_a_page_starts_has_its_output_written_by_another(tmp_path):
-    jobs, seen = Jobs(tmp_path), set()
+    jobs, files = Jobs(tmp_path), set()
     job = jobs.start("move", ["acquire", "move", "psg", "90"], {}, tmp_path)
     while jobs.running(job):
         with contextlib.suppress(FileNotFoundError):
-            seen.update(_open_files(job.pid))
+            files.update(_open_files(job.pid))
     _wait_for(lambda: jobs.code(job) == 0)
     assert "psg at 90" in jobs.output(job)
-    assert seen
-    assert not [path for path in seen if tmp_path in path.parents]
+    assert files
+    assert not [path for path in files if tmp_path in path.parents]
 
 
 @pytest.mark.timeout(120)

@@ -34,15 +34,15 @@ TWICE = {
 def test_a_file_given_twice_is_refused(name, configs, tmp_path, capfd, monkeypatch):
     """It halved the variance of what is fitted: the same noise was taken for two."""
     main, options = TWICE[name]
-    one, other = tmp_path / "one.h5", tmp_path / "other.h5"
-    one.write_bytes(b"")
+    file, link = tmp_path / "one.h5", tmp_path / "other.h5"
+    file.write_bytes(b"")
     monkeypatch.chdir(tmp_path)
     shutil.copy(configs / "geometries/one_inch_sphere.yaml", tmp_path / "g.yaml")
-    other.symlink_to(one)
+    link.symlink_to(file)
     with pytest.raises(SystemExit) as end:
-        main([*([name] if main is process else []), str(one), str(other), *options])
+        main([*([name] if main is process else []), str(file), str(link), *options])
     assert end.value.code == 2
-    assert f"{other} is given twice, also as {one}" in capfd.readouterr().err
+    assert f"{link} is given twice, also as {file}" in capfd.readouterr().err
 
 
 def product(path):

@@ -277,14 +277,16 @@ def test_a_gain_that_changes_is_known_to_reduce_and_to_diagnose(run_with, tmp_pa
     with Capture(path) as capture:
         (text,) = [text for text in capture.closing["messages"] if "false frame" in text]
         assert "from state 20 on: the light is 1.1 times" in text
-        assert [(found["kind"], found["state"]) for found in capture.closing["evidence"]] == [("brightness", 20)]
+        assert [(evidence["kind"], evidence["state"]) for evidence in capture.closing["evidence"]] == [
+            ("brightness", 20)
+        ]
         assert text.partition("false frame: ")[2] in read_capture(capture, capture.instrument).evidence
     product = tmp_path / "product.h5"
     with pytest.raises(SystemExit) as end:
         main(["reduce", str(path), "--out", str(product), "--no-figure"])
     assert end.value.code == 0
-    with Product(product) as made:
-        assert any("from state 20 on: the light is 1.1 times" in line for line in made.facts["warnings"])
+    with Product(product) as reader:
+        assert any("from state 20 on: the light is 1.1 times" in line for line in reader.facts["warnings"])
 
 
 def test_frames_that_were_frozen_are_found_in_the_file_itself(run_with):

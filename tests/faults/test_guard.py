@@ -24,9 +24,9 @@ from simulators.serial.reply_faults import parse_fault
 def served(quick_rig, tmp_path, monkeypatch):
     """A rig whose emulators live in this process, so that they outlast the program that is killed."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    told = tmp_path / "told.txt"
+    alarms = tmp_path / "told.txt"
     hook = tmp_path / "hook.sh"
-    hook.write_text(f'#!/bin/sh\necho "$1" >> {told}\n')
+    hook.write_text(f'#!/bin/sh\necho "$1" >> {alarms}\n')
     hook.chmod(0o755)
     # Emulators of another program keep their own time: on a busy machine they answer late.
     patient = {"reply_s": 60}
@@ -39,7 +39,7 @@ def served(quick_rig, tmp_path, monkeypatch):
     top = {"settle_s": 0.0, "alert": [str(hook)], "alert_every_s": 1, "axes": axes, "source": source}
     rig = quick_rig("behind.yaml", clock_speed=4, top=top)
     with serve(rig, tmp_path / "served.yaml", "red_sphere") as simulation:
-        yield simulation, tmp_path / "served.yaml", told
+        yield simulation, tmp_path / "served.yaml", alarms
 
 
 def _lit(simulation):
@@ -59,7 +59,7 @@ def _until(condition, child=None):
 
 @pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGSTOP])
 def test_killed_or_frozen_the_light_is_shut_and_the_axes_stop(kind, spawn, partial_of, served, intact, tmp_path):
-    simulation, rig, told = served
+    simulation, rig, alarms = served
     child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out")
     partial = partial_of(tmp_path / "out", child, states=5)
     _until(lambda: _lit(simulation) and _moving(simulation), child)
@@ -70,7 +70,7 @@ def test_killed_or_frozen_the_light_is_shut_and_the_axes_stop(kind, spawn, parti
     events = [json.loads(line)["event"] for line in journal.read_text().splitlines()]
     assert events[0] == "guard watches"
     assert {"light shut", "axes at rest"} <= set(events)
-    _until(lambda: told.exists() and "light shut, axes at rest" in told.read_text())
+    _until(lambda: alarms.exists() and "light shut, axes at rest" in alarms.read_text())
     assert child.wait() == -signal.SIGKILL
     # What was done is there, and the rig is free again.
     assert intact(partial) >= 5
@@ -83,10 +83,10 @@ def test_killed_or_frozen_the_light_is_shut_and_the_axes_stop(kind, spawn, parti
 @pytest.fixture
 def watched_rig(served):
     """The served rig, open in this process, with a guard that watches it."""
-    simulation, rig, told = served
+    simulation, rig, alarms = served
     with open_rig(load_rig(rig), with_camera=False) as live:
         live.start_guard(rig.parent / "guard.jsonl")
-        yield live, simulation, told
+        yield live, simulation, alarms
 
 
 def _guard_of(rig):
@@ -138,7 +138,7 @@ def _guards_of(pid):
 @pytest.mark.parametrize("fault", ["silent", "garbled"])
 def test_a_light_that_acquire_cannot_shut_is_shut_by_the_guard(spawn, partial_of, served, tmp_path, fault):
     """The shutter's line answers with noise or nothing; when it is well again the guard shuts the light."""
-    simulation, rig, told = served
+    simulation, rig, alarm_file = served
     config = load_rig(rig)
     rig.write_text(dump_yaml(config.model_copy(update={"source": config.source.model_copy(update={"reply_s": 1.0})})))
     child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out")
@@ -152,7 +152,7 @@ def test_a_light_that_acquire_cannot_shut_is_shut_by_the_guard(spawn, partial_of
     assert child.returncode != 0
     assert alarms.ACKNOWLEDGE in err
     # The alarm repeats, and stays when the line is well and the light is off.
-    _until(lambda: told.exists() and told.read_text().count("THE LIGHT IS NOT SHUT") >= 2)
+    _until(lambda: alarm_file.exists() and alarm_file.read_text().count("THE LIGHT IS NOT SHUT") >= 2)
     shutter.faults.clear()
     _until(lambda: not _lit(simulation))
     (alarm,) = alarms.unacknowledged()
@@ -162,7 +162,7 @@ def test_a_light_that_acquire_cannot_shut_is_shut_by_the_guard(spawn, partial_of
 
 @pytest.mark.parametrize(("port", "fault"), [("rotators", "garbled"), ("arm", "silent")])
 def test_an_axis_whose_stop_is_not_confirmed_is_stopped_by_the_guard(spawn, partial_of, served, tmp_path, port, fault):
-    simulation, rig, told = served
+    simulation, rig, alarm_file = served
     config = load_rig(rig)
     axes = {name: entry.model_copy(update={"reply_s": 1.0}) for name, entry in config.axes.items()}
     rig.write_text(dump_yaml(config.model_copy(update={"axes": axes})))
@@ -179,7 +179,7 @@ def test_an_axis_whose_stop_is_not_confirmed_is_stopped_by_the_guard(spawn, part
     assert "does not answer whether it rests" in err
     assert "AN AXIS MAY MOVE" in err
     assert "THE LIGHT MAY BE ON" not in err
-    _until(lambda: told.exists() and told.read_text().count("AXES NOT AT REST") >= 2)
+    _until(lambda: alarm_file.exists() and alarm_file.read_text().count("AXES NOT AT REST") >= 2)
     line.faults.clear()
     journal = tmp_path / "out" / "guard.jsonl"
     _until(lambda: "axes at rest" in journal.read_text())

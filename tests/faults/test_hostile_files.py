@@ -96,8 +96,8 @@ def test_no_option_waits_for_what_is_no_file(
     for command in ("reduce", "mean", "camera"):
         assert process_refuses(command, odd)
     assert process_refuses("calibrate-mosaic", capture, "--instrument", odd)
-    given = ("--instrument", instrument, "--wavelength", 662, "--out", tmp_path / "out.h5")
-    assert process_refuses("import", "--states", odd, *given)
+    options = ("--instrument", instrument, "--wavelength", 662, "--out", tmp_path / "out.h5")
+    assert process_refuses("import", "--states", odd, *options)
 
 
 def test_a_circle_of_links_is_no_place_for_a_product(process, synthetic_capture, tmp_path):
@@ -176,46 +176,46 @@ def set_exposure(value):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("spoil", "message"),
     [
         (set_targets(np.nan), "state 2"), (set_targets(11.0), "state 2"), (set_targets(1e308), "state 2"),
         (set_schema, "2.5"), (set_exposure(0.0), "exposure of 0 s"), (set_exposure(-1.0), "exposure of -1 s"),
     ],
 )  # fmt: skip
-def test_a_resume_does_not_go_where_the_plan_does_not(spoil, said, partial, acquire, tmp_path):
+def test_a_resume_does_not_go_where_the_plan_does_not(spoil, message, partial, acquire, tmp_path):
     with h5py.File(partial, "r+") as h5:
         spoil(h5)
     code, _, err = acquire("--resume", partial, "--rig", tmp_path / "rig.yaml")
     assert code in (1, 2)
-    assert said in err
+    assert message in err
     assert "Traceback" not in err
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("omega_deg: 1.0e+308", "beyond anything"), ("omega_deg: 4_5", "without _"), ("omega_deg: '4_5'", "without _"),
         ('title: "a\\e[2Jb"', "control characters"), ('"\\e": 1', "control characters"),
         ('title: "\\u202eb"', "control characters"), ("exposure_s: -1", "positive"), ("exposure_s: 0", "positive"),
     ],
 )  # fmt: skip
-def test_a_plan_that_cannot_be_meant_is_refused(text, said):
-    with pytest.raises(ConfigError, match=said) as refused:
+def test_a_plan_that_cannot_be_meant_is_refused(text, message):
+    with pytest.raises(ConfigError, match=message) as refused:
         parse_yaml(f"kind: plan\n{text}\n", MeasurementPlan)
     assert "\x1b" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "said"),
+    ("key", "value", "message"),
     [
         ("wavelengths_nm", [451, 451], "wavelength 451"), ("omega_deg", [30, 30.0], "angle 30"),
         ("samples", [{"name": "a"}, {"name": "a"}], "sample a"), ("exposure_s", {451: 0.0, 662: 0.1}, "exposure_s"),
         ("exposure_s", {451: -1.0}, "exposure_s"), ("omega_deg", [1e300], "beyond"),
     ],
 )  # fmt: skip
-def test_a_campaign_that_cannot_be_meant_is_refused(key, value, said, configs, tmp_path):
+def test_a_campaign_that_cannot_be_meant_is_refused(key, value, message, configs, tmp_path):
     source, path = configs / "campaigns" / "red_sphere.yaml", tmp_path / "c.yaml"
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         Campaign.load(change_yaml(source, lambda campaign: campaign.update({key: value}), to=path))
 
 

@@ -42,8 +42,8 @@ class Injected:
         place, name, errors, calls = CALLS[kind]
         # The disc process counts too.
         self._armed = multiprocessing.Value("b", False)
-        left, until = chance.randint(1, calls), chance.choice([1, 10**9])
-        self._left, self._until = multiprocessing.Value("l", left), multiprocessing.Value("l", until)
+        countdown, until = chance.randint(1, calls), chance.choice([1, 10**9])
+        self._left, self._until = multiprocessing.Value("l", countdown), multiprocessing.Value("l", until)
         self.holds_the_light = place is SerialLink and until > 1
         self._error = chance.choice(errors)
         call = getattr(place, name)

@@ -59,9 +59,9 @@ def test_the_disc_keeps_what_was_synced_and_only_that(tmp_path):
     for call in read_record(record):
         disc.apply(call)
     assert disc.after_power_cut(None) == {"/a/x": b"safe"}
-    seen = [disc.after_power_cut(random.Random(seed)) for seed in range(60)]
-    assert {tuple(sorted(files)) for files in seen} == {("/a/x",), ("/a/y",), ("/a/y", "/b/z")}
-    assert {content for files in seen for path, content in files.items() if path.startswith("/a/")} == {
+    discs = [disc.after_power_cut(random.Random(seed)) for seed in range(60)]
+    assert {tuple(sorted(files)) for files in discs} == {("/a/x",), ("/a/y",), ("/a/y", "/b/z")}
+    assert {content for files in discs for path, content in files.items() if path.startswith("/a/")} == {
         b"safe",
         b"sa!!",
     }

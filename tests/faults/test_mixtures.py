@@ -107,19 +107,19 @@ def test_an_edited_instrument_or_scene_is_refused(run_with, configs, tmp_path):
 def test_other_devices_and_camera_settings_are_refused(partial):
     with Capture(partial) as capture:
         began = capture.segments[0]
-        told = {name: dict(device) for name, device in began.identity.devices.items()}
+        devices = {name: dict(device) for name, device in began.identity.devices.items()}
         settings = CameraSettings(**began.camera_settings)
 
         def rig(**camera):
             return SimpleNamespace(
-                describe=lambda: told,
+                describe=lambda: devices,
                 require_camera=lambda: SimpleNamespace(settings=settings.model_copy(update=camera)),
             )
 
         require_same_devices(capture, *devices_of(rig()))
         with pytest.raises(Differs, match=r"camera setting.gain_db: .* at the start, 6.0 now"):
             require_same_devices(capture, *devices_of(rig(gain_db=6.0)))
-        told["psa"]["serial_number"] = "another"
+        devices["psa"]["serial_number"] = "another"
         with pytest.raises(Differs, match=r"device.psa.serial_number: 110002 at the start, another now"):
             require_same_devices(capture, *devices_of(rig()))
 
@@ -133,11 +133,11 @@ def test_plan_options_are_refused_with_resume(partial, acquire):
 
 def test_as_new_keeps_apart(partial, quick_rig, acquire, intact):
     before = partial.read_bytes()
-    other = _edited(quick_rig(), detector__black_level_counts=70)
-    code, _, err = acquire("--resume", partial, "--rig", other)
+    edited_rig = _edited(quick_rig(), detector__black_level_counts=70)
+    code, _, err = acquire("--resume", partial, "--rig", edited_rig)
     assert code == 2
     assert "--as-new" in err
-    code, _, err = acquire("--resume", partial, "--rig", other, "--as-new")
+    code, _, err = acquire("--resume", partial, "--rig", edited_rig, "--as-new")
     assert code == 0, err
     assert partial.read_bytes() == before
     assert intact(partial.parent / "run-2.h5") == 19

@@ -67,8 +67,8 @@ def test_frames_in_another_order_than_the_rows_are_never_mixed_up(lab, log, drr,
     stack = ("--stack", tmp_path / "Läufe")
     assert "Add --columns 'file=Bild'" in process_refuses("import", *log, *stack, *drr)
     assert process("import", *log, *stack, *drr, "--columns", "file=Bild")[0] == 0
-    found, angles = levels(tmp_path / "c.h5")
-    assert found == [100 + k for k in SHUFFLED]
+    intensities, angles = levels(tmp_path / "c.h5")
+    assert intensities == [100 + k for k in SHUFFLED]
     assert angles["psg"] == pytest.approx(ANGLES["psg"][list(SHUFFLED)])
 
 
@@ -76,21 +76,21 @@ def test_a_number_of_the_frame_in_another_order_is_asked_about(drr, lab, tmp_pat
     table = tmp_path / "log.txt"
     rows = [f"{k} {ANGLES['psg'][k]}  {ANGLES['psa'][k]}" for k in SHUFFLED]
     table.write_text("\n".join(["# rotator log", "frame  psg psa", *rows]) + "\n")
-    given = ("--states", table, "--columns", "psg=psg", "--stack", tmp_path / "Läufe", *drr)
-    said = process_refuses("import", *given)
-    assert "--columns 'state=frame'" in said
-    assert "--columns state=rows" in said
-    assert process("import", *given, "--columns", "state=frame")[0] == 0
+    options = ("--states", table, "--columns", "psg=psg", "--stack", tmp_path / "Läufe", *drr)
+    err = process_refuses("import", *options)
+    assert "--columns 'state=frame'" in err
+    assert "--columns state=rows" in err
+    assert process("import", *options, "--columns", "state=frame")[0] == 0
     assert levels(tmp_path / "c.h5")[1]["psg"] == pytest.approx(ANGLES["psg"])
-    assert process("import", *given, "--columns", "state=rows", "--overwrite")[0] == 0
+    assert process("import", *options, "--columns", "state=rows", "--overwrite")[0] == 0
     assert levels(tmp_path / "c.h5")[1]["psg"] == pytest.approx(ANGLES["psg"][list(SHUFFLED)])
 
 
 def test_times_in_milliseconds_are_not_taken_for_seconds(lab, log, drr, tmp_path, process, process_refuses):
-    given = (*log, "--columns", "file=Bild", "--stack", tmp_path / "Läufe", *drr)
-    said = process_refuses("import", *given, "--columns", "exposure_s=Belichtung ms")
-    assert "--columns 'exposure_ms=Belichtung ms'" in said
-    assert process("import", *given, "--columns", "exposure_ms=Belichtung ms")[0] == 0
+    options = (*log, "--columns", "file=Bild", "--stack", tmp_path / "Läufe", *drr)
+    err = process_refuses("import", *options, "--columns", "exposure_s=Belichtung ms")
+    assert "--columns 'exposure_ms=Belichtung ms'" in err
+    assert process("import", *options, "--columns", "exposure_ms=Belichtung ms")[0] == 0
     with h5py.File(tmp_path / "c.h5") as h5:
         assert h5["entry/states/exposure_s"][:] == pytest.approx(0.0125)
 
@@ -101,8 +101,8 @@ def test_angles_in_the_names_of_the_frames(drr, tmp_path, process, process_refus
         cv2.imwrite(str(tmp_path / name), FRAMES[k])
     assert "--stack 'FOLDER/name_{AXIS}.tif'" in process_refuses("import", "--stack", tmp_path, *drr)
     assert process("import", "--stack", tmp_path / "G{psg}_A{psa}.tif", *drr)[0] == 0
-    found, angles = levels(tmp_path / "c.h5")
-    states = [level - 100 for level in found]
+    intensities, angles = levels(tmp_path / "c.h5")
+    states = [level - 100 for level in intensities]
     assert sorted(states) == list(range(6))
     assert angles["psa"] == pytest.approx(ANGLES["psa"][states])
 
@@ -114,8 +114,8 @@ def test_pages_of_a_tiff_are_states_and_none_is_dropped(lab, drr, tmp_path, proc
     assert process("import", *angles, "--stack", tmp_path / "run.tif", *drr)[0] == 0
     assert levels(tmp_path / "c.h5")[0] == [100 + k for k in range(6)]
     cv2.imwritemulti(str(tmp_path / "Läufe" / "Bild 7.tif"), list(FRAMES[:2]))
-    said = process_refuses("import", *angles, "--stack", tmp_path / "Läufe", *drr, "--overwrite")
-    assert "Bild 7.tif: has 2 pages" in said
+    err = process_refuses("import", *angles, "--stack", tmp_path / "Läufe", *drr, "--overwrite")
+    assert "Bild 7.tif: has 2 pages" in err
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
@@ -124,10 +124,10 @@ def test_a_polarization_camera_needs_no_table(kind, tmp_path, process):
     (tmp_path / "shots").mkdir()
     for k in range(3):
         cv2.imwrite(str(tmp_path / "shots" / f"shot {k}.png"), np.full((4, 6), 50 + k, kind))
-    given = ("--wavelength-nm", 550, "--instrument", tmp_path / "camera.yaml", "--out", tmp_path / "c.h5")
-    assert process("import", "--stack", tmp_path / "shots", *given)[0] == 0
+    options = ("--wavelength-nm", 550, "--instrument", tmp_path / "camera.yaml", "--out", tmp_path / "c.h5")
+    assert process("import", "--stack", tmp_path / "shots", *options)[0] == 0
     assert levels(tmp_path / "c.h5")[0] == [50, 51, 52]
-    assert process("import", "--stack", tmp_path / "shots/shot 1.png", *given, "--overwrite")[0] == 0
+    assert process("import", "--stack", tmp_path / "shots/shot 1.png", *options, "--overwrite")[0] == 0
     assert levels(tmp_path / "c.h5")[0] == [51]
 
 
@@ -138,24 +138,24 @@ def test_fields_and_rows_of_tables_in_hdf5(drr, tmp_path, process, process_refus
         h5["motors"], h5["both"], h5["images"] = motors, np.stack(list(ANGLES.values())), FRAMES
         h5["dark"] = np.moveaxis(np.zeros((2, 4, 5), np.uint16), 0, -1)
     file = tmp_path / "run.h5"
-    given = ("--stack", f"{file}::/images", "--darks", f"{file}::/dark", *drr)
+    options = ("--stack", f"{file}::/images", "--darks", f"{file}::/dark", *drr)
     fields = ("--columns", f"psg={file}::/motors[theta1]", "--columns", f"psa={file}::/motors[theta2]")
-    assert "run.h5::/motors[theta1]'" in process_refuses("import", "--columns", f"psg={file}::/motors", *given)
-    assert process("import", *fields, "--angles", "radians", *given)[0] == 0
+    assert "run.h5::/motors[theta1]'" in process_refuses("import", "--columns", f"psg={file}::/motors", *options)
+    assert process("import", *fields, "--angles", "radians", *options)[0] == 0
     assert levels(tmp_path / "c.h5")[1]["psa"][:6] == pytest.approx(ANGLES["psa"])
     rows = ("--columns", f"psg={file}::/both[0]", "--columns", f"psa={file}::/both[1]")
-    assert process("import", *rows, *given, "--overwrite")[0] == 0
-    found, angles = levels(tmp_path / "c.h5")
-    assert found == [100, 101, 102, 103, 104, 105, 0, 0]
+    assert process("import", *rows, *options, "--overwrite")[0] == 0
+    intensities, angles = levels(tmp_path / "c.h5")
+    assert intensities == [100, 101, 102, 103, 104, 105, 0, 0]
     assert angles["psg"][:6] == pytest.approx(ANGLES["psg"])
 
 
 def test_radians_are_named_by_their_header_and_degrees_are_not_taken_for_them(drr, lab, tmp_path, process_refuses):
     table = tmp_path / "log.csv"
     table.write_text("a (rad),b (rad)\n" + "".join(f"{4.0 * k},{20.0 * k}\n" for k in range(6)))
-    given = ("--states", table, "--columns", "psg=a (rad)", "--columns", "psa=b (rad)", "--stack", tmp_path / "Läufe")
-    assert "Add --angles radians" in process_refuses("import", *given, *drr)
-    assert "Add --angles degrees" in process_refuses("import", *given, "--angles", "radians", *drr)
+    options = ("--states", table, "--columns", "psg=a (rad)", "--columns", "psa=b (rad)", "--stack", tmp_path / "Läufe")
+    assert "Add --angles radians" in process_refuses("import", *options, *drr)
+    assert "Add --angles degrees" in process_refuses("import", *options, "--angles", "radians", *drr)
 
 
 def test_a_missing_frame_is_named(drr, lab, tmp_path, process_refuses):
@@ -163,9 +163,9 @@ def test_a_missing_frame_is_named(drr, lab, tmp_path, process_refuses):
     np.save(tmp_path / "psg.npy", ANGLES["psg"])
     np.save(tmp_path / "psa.npy", ANGLES["psa"])
     angles = ("--columns", f"psg={tmp_path}/psg.npy", "--columns", f"psa={tmp_path}/psa.npy")
-    said = process_refuses("import", *angles, "--stack", tmp_path / "Läufe", *drr)
-    assert "5 frames for 6 states" in said
-    assert "leave out 9" in said
+    err = process_refuses("import", *angles, "--stack", tmp_path / "Läufe", *drr)
+    assert "5 frames for 6 states" in err
+    assert "leave out 9" in err
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252", "utf-16"])
@@ -178,8 +178,8 @@ def test_tables_of_any_system(tmp_path, encoding):
 
 def test_a_table_without_names_is_refused_with_what_to_type(lab, drr, tmp_path, process_refuses):
     np.savetxt(tmp_path / "t.txt", np.ones((6, 2)))
-    given = ("--states", tmp_path / "t.txt", "--stack", tmp_path / "Läufe")
-    assert "--columns 'psg=" in process_refuses("import", *given, *drr)
+    options = ("--states", tmp_path / "t.txt", "--stack", tmp_path / "Läufe")
+    assert "--columns 'psg=" in process_refuses("import", *options, *drr)
 
 
 @pytest.mark.parametrize(
@@ -213,8 +213,8 @@ def test_numbers_that_are_no_degrees_are_refused(drr, lab, tmp_path, process_ref
     table = tmp_path / "log.csv"
     table.write_text(head + "\n" + "".join(f"{12.5 * k * scale},{62.5 * k * scale}\n" for k in range(6)))
     a, b = head.splitlines()[0].split(",")
-    given = ("--states", table, "--columns", f"psg={a}", "--columns", f"psa={b}", "--stack", tmp_path / "Läufe")
-    assert word in process_refuses("import", *given, *drr)
+    options = ("--states", table, "--columns", f"psg={a}", "--columns", f"psa={b}", "--stack", tmp_path / "Läufe")
+    assert word in process_refuses("import", *options, *drr)
 
 
 def test_frames_that_cannot_be_raw_are_refused(drr, tmp_path, process_refuses):
@@ -228,8 +228,8 @@ def test_an_array_that_is_not_in_a_file_is_answered_with_those_that_are(drr, tmp
         h5["scan/frames"], h5["scan/angle"] = FRAMES, ANGLES["psg"]
     np.savez(tmp_path / "run.npz", frames=FRAMES, angle=ANGLES["psg"])
     for file, names in (("run.h5", "/scan/angle, /scan/frames"), ("run.npz", "frames, angle")):
-        said = process_refuses("import", "--columns", f"psg={tmp_path / file}::psg", "--stack", tmp_path / file, *drr)
-        assert f"it has {names}" in said
+        err = process_refuses("import", "--columns", f"psg={tmp_path / file}::psg", "--stack", tmp_path / file, *drr)
+        assert f"it has {names}" in err
 
 
 def test_an_archive_that_promises_more_than_it_holds_is_refused(drr, tmp_path, process_refuses):

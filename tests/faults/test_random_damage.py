@@ -13,5 +13,5 @@ FUZZ = Path(__file__).with_name("fuzz_doors.py")
 def test_random_damage_at_every_door():
     """A fixed seed and few inputs; CI itself gives each door half a minute (.ci/run)."""
     command = [sys.executable, str(FUZZ), "--inputs", "15", "--seed", "20"]
-    found = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert found.returncode == 0, found.stdout[-3000:] + found.stderr[-2000:]
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stdout[-3000:] + process.stderr[-2000:]

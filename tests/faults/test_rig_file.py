@@ -154,15 +154,15 @@ def solids(*parts, margin=10.0):
 
 
 def test_a_post_on_the_way_is_found_although_both_ends_are_free():
-    both = solids(ARM, POST)
-    assert find_clash(both, {"arm": (45, 45)}) is None
-    assert find_clash(both, {"arm": (135, 135)}) is None
-    clash = find_clash(both, {"arm": (45, 135)})
+    parts = solids(ARM, POST)
+    assert find_clash(parts, {"arm": (45, 45)}) is None
+    assert find_clash(parts, {"arm": (135, 135)}) is None
+    clash = find_clash(parts, {"arm": (45, 135)})
     assert {clash.first.name, clash.second.name} == {"arm", "post"}
     # The arm's edge nears the post's by 10 mm: half width 20 + margin 10 + radius 20, at about 300 mm.
     assert 75 < clash.angle_deg < 90 - math.degrees(math.atan(40 / 320))
     # Nobody knows where an axis without a reference stands.
-    assert find_clash(both, {}) is not None
+    assert find_clash(parts, {}) is not None
     # Above it is free.
     assert find_clash(solids(ARM, {**POST, "centre_mm": [300, 120, 0]}), {"arm": (0, 360)}) is None
 
@@ -182,17 +182,17 @@ def test_no_pose_between_is_missed(centre, size, way, shape):
         "disc": {"radius_mm": size[0], "thickness_mm": size[1]},
     }
     standing = {"name": "it", "shape": shape, "centre_mm": [centre[0], 0, centre[1]], **kinds[shape]}
-    both = solids(ARM, standing)
+    pair = solids(ARM, standing)
     low, high = way[0], way[0] + way[1]
-    a, b = (footprint(part) for part in both.parts)
+    a, b = (footprint(part) for part in pair.parts)
     nearest = min(gap_mm(a.turned(angle), b) for angle in np.linspace(low, high, 300))
-    found = find_clash(both, {"arm": (low, high)}) is not None
+    clashes = find_clash(pair, {"arm": (low, high)}) is not None
     # Between two of these looks the arm comes at most so much nearer.
     between = math.radians(way[1] / 299) * a.reach_mm / 2
     if nearest < 10.0:
-        assert found
+        assert clashes
     elif nearest > 10.0 + RESOLUTION_MM + between:
-        assert not found
+        assert not clashes
 
 
 def test_footprints_keep_the_distance_that_can_be_worked_out():

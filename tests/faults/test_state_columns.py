@@ -46,7 +46,7 @@ def test_a_reduction_weighs_and_tells_errors_by_the_noise_that_is_stated(tmp_pat
     w = InstrumentModel.load(instrument).nominal_at(1200).rows({"psg": psg}).reshape(46, 2, 16)
     light = 1000 * w @ np.eye(4).reshape(16)
     sigma = np.where(np.arange(46) % 2, 1.0, 10.0)
-    found, errors = [], []
+    matrices, errors = [], []
     for k in range(12):
         noisy = light + sigma[:, None] * random.standard_normal(light.shape)
         rows = [f"{n},{psg[n]},{a},{b},{sigma[n]}" for n, (a, b) in enumerate(noisy)]
@@ -56,10 +56,10 @@ def test_a_reduction_weighs_and_tells_errors_by_the_noise_that_is_stated(tmp_pat
             model = InstrumentModel.load(instrument).nominal_at(1200)
             facts = reduce_mueller(capture, model, product, (), choice=Choice(weighted=weighted))
         image = MuellerImage.load(product)
-        found.append(image.values[..., 0, 0])
+        matrices.append(image.values[..., 0, 0])
         errors.append(image.errors[..., 0, 0])
     assert "sigma" in facts["noise"]
-    pull = (np.array(found) - 1000 * np.eye(4)) / np.array(errors)
+    pull = (np.array(matrices) - 1000 * np.eye(4)) / np.array(errors)
     assert np.sqrt(np.mean(pull**2)) == pytest.approx(1.0, abs=0.25)
     # Weights use the precise half; without them the noisy half decides.
     assert (errors[0].max() < 12.0) == weighted

@@ -65,8 +65,8 @@ def test_twice_stops_the_axes_within_a_second(spawn, partial_of, served, intact,
         assert "Traceback" not in err
         assert "stopped at once" in err or not partial.exists()
         # A state may have been the last one: then the first Ctrl-C had already ended the run in order.
-        kept = partial if partial.exists() else next(folder.glob("*.h5"))
-        intact(kept)
+        capture = partial if partial.exists() else next(folder.glob("*.h5"))
+        intact(capture)
 
 
 def test_once_at_random_times(spawn, partial_of, served, intact, runs, tmp_path):

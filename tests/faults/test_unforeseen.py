@@ -41,9 +41,9 @@ def test_an_error_that_nobody_foresaw_is_recorded_and_the_capture_goes_on(run_wi
 @pytest.fixture
 def night(acquire, small_rig, tmp_path):
     """Runs a campaign of one capture with so many retries; returns exit code, what was said, index and log."""
-    told = tmp_path / "told.txt"
+    alarms = tmp_path / "told.txt"
     hook = tmp_path / "hook.sh"
-    hook.write_text(f'#!/bin/sh\necho "$1" >> {told}\n')
+    hook.write_text(f'#!/bin/sh\necho "$1" >> {alarms}\n')
     hook.chmod(0o755)
     plan = tmp_path / "plan.yaml"
     plan.write_text(
@@ -61,7 +61,7 @@ def night(acquire, small_rig, tmp_path):
         folder = tmp_path / "night"
         (entry,) = json.loads((folder / "index.json").read_text()).values()
         events = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-        return code, out + err, entry, events, told.read_text() if told.exists() else ""
+        return code, out + err, entry, events, alarms.read_text() if alarms.exists() else ""
 
     return run
 
@@ -76,8 +76,8 @@ def test_the_plans_retries_are_used(night, monkeypatch):
         return take(*arguments, **options)
 
     monkeypatch.setattr(session, "take", fail_once)
-    code, said, entry, events, _ = night(retries=1)
-    assert code == 0, said
+    code, text, entry, events, _ = night(retries=1)
+    assert code == 0, text
     assert entry["status"] == "complete"
     (failed,) = [event for event in events if event["event"] == "capture failed"]
     assert "Traceback" in failed["traceback"]
@@ -87,29 +87,29 @@ def test_the_plans_retries_are_used(night, monkeypatch):
 def test_a_campaign_whose_disc_process_was_killed_takes_its_folder_again(
     night, monkeypatch, tmp_path, somebody_was_faster
 ):
-    take, tries, others = session.take, [], filelock.FileLock(tmp_path / "night" / ".lock")
+    take, tries, lock = session.take, [], filelock.FileLock(tmp_path / "night" / ".lock")
 
     def killed_once(*arguments, **options):
         tries.append(1)
         if len(tries) == 1:
             os.kill(disc().pid, signal.SIGKILL)
             if somebody_was_faster:
-                others.acquire(timeout=60)
-        taken = take(*arguments, **options)
+                lock.acquire(timeout=60)
+        result = take(*arguments, **options)
         with pytest.raises(filelock.Timeout):
-            others.acquire(timeout=0)
-        return taken
+            lock.acquire(timeout=0)
+        return result
 
     monkeypatch.setattr(session, "take", killed_once)
-    code, said, *_ = night(retries=1)
-    others.release()
+    code, text, *_ = night(retries=1)
+    lock.release()
     if somebody_was_faster:
         assert code == 1
-        assert "another program runs the campaign" in said
+        assert "another program runs the campaign" in text
         assert len(tries) == 1
     else:
         # The end of the process is seen before the capture begins, or by the capture, which is then tried again.
-        assert code == 0, said
+        assert code == 0, text
 
 
 @pytest.mark.parametrize("where", [(session, "take"), (Operator, "prepare")])
@@ -118,14 +118,14 @@ def test_a_night_that_ends_by_any_error_says_so_everywhere(night, monkeypatch, w
         raise KeyError("injected")
 
     monkeypatch.setattr(*where, fail)
-    code, said, entry, events, told = night(retries=0)
+    code, text, entry, events, alarms = night(retries=0)
     assert code == 1
-    assert "an unforeseen error ended the run: KeyError: 'injected'" in said
-    assert "Traceback" not in said
+    assert "an unforeseen error ended the run: KeyError: 'injected'" in text
+    assert "Traceback" not in text
     assert entry["status"] == "failed"
     assert events[-1]["event"] == "campaign failed"
     assert "Traceback" in events[-1]["traceback"]
-    assert "KeyError" in told
+    assert "KeyError" in alarms
 
 
 def test_a_stop_between_captures_leaves_nothing_running(night, monkeypatch):

@@ -48,11 +48,11 @@ def test_who_reads_row_by_row_has_each_chunk_unpacked_once(write, monkeypatch, m
     decompress = isal_zlib.decompress
     monkeypatch.setattr(isal_zlib, "decompress", lambda raw: unpacked.append(raw) or decompress(raw))
     values = np.arange(np.prod(SHAPE), dtype=np.uint16).reshape(SHAPE)
-    kept = KeptChunks()
+    cache = KeptChunks()
     with write(values) as h5:
         for state in range(3):
             for row in range(70):
-                rows = read_rows(h5["packed"], slice(row, row + 1), (state,), kept)
+                rows = read_rows(h5["packed"], slice(row, row + 1), (state,), cache)
                 np.testing.assert_array_equal(rows, values[state, :, row : row + 1])
     # Three states of two channels of five chunks; where two fit, those of the two channels take turns.
     assert len(unpacked) == 3 * 2 * 5
@@ -90,8 +90,8 @@ def test_bytes_that_are_noise_are_stored_and_every_reader_finds_the_values(write
             np.testing.assert_array_equal(h5[name][...], values)
             np.testing.assert_array_equal(read_rows(h5[name], slice(None)), values)
         assert h5["packed"].id.get_storage_size() < 1.05 * every.id.get_storage_size()
-        told = h5["plain"].nbytes / best.ratio
-        assert h5["packed"].id.get_storage_size() == pytest.approx(told, rel=0.15)
+        size = h5["plain"].nbytes / best.ratio
+        assert h5["packed"].id.get_storage_size() == pytest.approx(size, rel=0.15)
 
 
 def test_a_stored_piece_may_be_longer_than_a_block_of_the_stream(tmp_path):

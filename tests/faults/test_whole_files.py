@@ -51,20 +51,20 @@ def full_disc(most_bytes=1000):
         sys.dont_write_bytecode = bytecode
 
 
-@pytest.mark.parametrize(("kind", "there"), [*((kind, False) for kind in WRITERS), ("csv", True), ("html", True)])
-def test_a_full_disc_leaves_nothing_half(product, kind, there, tmp_path, capsys):
+@pytest.mark.parametrize(("kind", "exists"), [*((kind, False) for kind in WRITERS), ("csv", True), ("html", True)])
+def test_a_full_disc_leaves_nothing_half(product, kind, exists, tmp_path, capsys):
     command, *options = WRITERS[kind]
     out = tmp_path / f"out{ENDINGS.get(kind, f'.{kind}')}"
     planes = [] if kind in ("html", "png") else ["--plane", "mueller"]
-    if there:
+    if exists:
         out.write_text("of yesterday")
     words = [command, str(product), *options, *planes, "--out", str(tmp_path / f"out.{kind}"), "--overwrite"]
     with full_disc(), pytest.raises(SystemExit) as end:
         main(words)
     assert end.value.code == 1
     assert "File too large" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ([out.name] if there else [])
-    if there:
+    assert [path.name for path in tmp_path.iterdir()] == ([out.name] if exists else [])
+    if exists:
         assert out.read_text() == "of yesterday"
     with pytest.raises(SystemExit) as end:
         main(words)

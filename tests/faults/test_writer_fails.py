@@ -64,10 +64,10 @@ def test_a_disc_that_takes_nothing_shuts_the_light_and_ends_the_run(run_with, in
         _failing_at(patch, 5, lambda: blocked.wait(60))
         error, path = run_with(lambda rig, *_: rigs.append(rig), plan=SHORT, observers=(Told(),))
     assert "the disc has not taken a state for 1 s" in str(error)
-    told = [number for number, entry in enumerate(lit) if "the disc takes no data" in str(entry)]
+    failures = [number for number, entry in enumerate(lit) if "the disc takes no data" in str(entry)]
     # The light comes before the words, not at the end of the run.
-    assert lit[told[0] - 1] == "set"
-    assert lit[told[0]][1] == 0
+    assert lit[failures[0] - 1] == "set"
+    assert lit[failures[0]][1] == 0
     assert not rigs[0].simulation.light()
     blocked.set()
     _let_go(path)
@@ -161,12 +161,12 @@ def test_a_damaged_partial_file_is_refused_in_a_line(run_with, acquire, tmp_path
 
 def test_a_byte_changed_on_the_disc_is_found_at_reading(run_with):
     _, path = run_with(plan=SHORT)
-    whole = path.read_bytes()
+    content = path.read_bytes()
     with Capture(path) as capture:
         assert capture.checked
         _read_all(capture)
     for where in ("instrument/detector/data", "instrument/psg/value", "states/exposure_s"):
-        path.write_bytes(whole)
+        path.write_bytes(content)
         with h5py.File(path, "r+") as h5:
             dataset = h5["entry"][where]
             index = (9,) + (0,) * (dataset.ndim - 1)
@@ -186,10 +186,10 @@ def _read_all(capture):
 
 
 def test_a_folder_deleted_in_mid_run_is_noticed_with_the_next_state(run_with, tmp_path):
-    seen = []
+    visits = []
 
     def delete(rig, state, retake):
-        seen.append(state)
+        visits.append(state)
         if state == 5:
             for path in tmp_path.glob("capture*/run.h5.partial"):
                 path.rename(tmp_path / "moved.h5")
@@ -197,7 +197,7 @@ def test_a_folder_deleted_in_mid_run_is_noticed_with_the_next_state(run_with, tm
     with pytest.raises(StopIteration):
         # Nothing of that name is left, which the fixture looks for.
         run_with(delete, plan=SHORT)
-    assert max(seen) <= 7
+    assert max(visits) <= 7
     with Capture(tmp_path / "moved.h5") as capture:
         assert 4 <= len(capture.done) <= 6
 
