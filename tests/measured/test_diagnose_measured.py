@@ -95,8 +95,8 @@ def test_the_telescope_at_one_wavelength(public_files, configs, tmp_path):
     d = diagnose_captures([path], model.model_copy(update={"calibrate": plain, "belongs_to": belongs}))[0].diagnosis
     # One angle for each ratio of two channels would leave less than the photon noise of 0.01 %. Whether what is found
     # is used is another question: one wavelength tells so little of M that it gets worse by a chance of 0.6 to 4 %.
-    left = next(check.after for check in d.correction.checks if check.name.startswith("rms on held-out data"))
-    assert 0.05 < left < 0.25
+    residual = next(check.after for check in d.correction.checks if check.name.startswith("rms on held-out data"))
+    assert 0.05 < residual < 0.25
 
 
 def held_out_of_each(public_files, configs: Path, tmp_path: Path, wavelengths: tuple[int, ...] | None) -> list[Check]:
@@ -112,17 +112,17 @@ def held_out_of_each(public_files, configs: Path, tmp_path: Path, wavelengths: t
 
 @pytest.mark.long
 def test_four_wavelengths_of_the_telescope_share_the_angles_of_their_states(public_files, configs, tmp_path):
-    told = held_out_of_each(public_files, configs, tmp_path, (1575, 1744, 1932, 2139))
-    assert len(told) == 4
-    assert all(0.01 < c.after < 0.2 < c.before for c in told)
+    checks = held_out_of_each(public_files, configs, tmp_path, (1575, 1744, 1932, 2139))
+    assert len(checks) == 4
+    assert all(0.01 < c.after < 0.2 < c.before for c in checks)
 
 
 @pytest.mark.skipif("UMOV_SLOW" not in os.environ, reason="takes six minutes: UMOV_SLOW=1")
 @pytest.mark.timeout(1800)
 def test_all_wavelengths_of_the_telescope(public_files, configs, tmp_path):
-    told = held_out_of_each(public_files, configs, tmp_path, None)
-    assert len(told) == 22
-    assert sum(c.after <= 0.25 for c in told) >= 18
+    checks = held_out_of_each(public_files, configs, tmp_path, None)
+    assert len(checks) == 22
+    assert sum(c.after <= 0.25 for c in checks) >= 18
 
 
 @pytest.mark.skipif("UMOV_SLOW" not in os.environ, reason="takes three minutes: UMOV_SLOW=1")
@@ -220,8 +220,8 @@ def test_wollaston_the_source_is_the_cause(public_files, configs, tmp_path):
     assert d.error_after.rms_percent <= d.error_before.rms_percent < 0.3
     assert d.captures[0].source_percent == pytest.approx(100 * np.std(total) / np.mean(total), rel=0.2)
     # The values hold for all states together, not only for each part that was held out.
-    whole = problem.undivided().sums(judged.solution.space, judged.solution.fit.values, derivatives=False)
-    assert np.sqrt(whole.square.sum() / whole.count.sum()) < 0.003
+    image_sums = problem.undivided().sums(judged.solution.space, judged.solution.fit.values, derivatives=False)
+    assert np.sqrt(image_sums.square.sum() / image_sums.count.sum()) < 0.003
 
 
 @pytest.mark.long
@@ -258,24 +258,24 @@ def test_the_gain_learnt_on_one_picture_mends_another(public_files, configs, tmp
     carried = extend_model(model, learnt).at(550)
     # What is carried is the mean over gains and extinctions, which these pictures cannot tell apart. The closure over
     # the gains sees the gains alone; the model's own residual sees both.
-    other, left = capture("fruits"), []
+    picture, chi2 = capture("fruits"), []
     for instrument_model in (model.at(550), carried):
-        with Capture(other) as fruits:
+        with Capture(picture) as fruits:
             problem = InstrumentProblem(instrument_model, [read_capture(fruits, instrument_model)])
         sums = problem.sums(Space(()), np.zeros(0), derivatives=False)
-        left.append(1 + sums.excess.sum() / sums.freedom.sum())
-    assert left[0] > 2.5
-    assert left[1] < 1.03
+        chi2.append(1 + sums.excess.sum() / sums.freedom.sum())
+    assert chi2[0] > 2.5
+    assert chi2[1] < 1.03
 
 
 def test_the_middle_of_a_textured_picture_is_not_dark(public_files, configs, tmp_path):
     """A picture with a median of 12 counts of 255 and glossy highlights: its noise is not more than its signal."""
-    (whole,) = (t for t in tables_of("dofp-imx250mzr", public_files("dofp-imx250mzr")) if t.name == "camera")
-    picture = cv2.imread(whole.rows[0].split(",")[1], cv2.IMREAD_UNCHANGED)
+    (camera,) = (t for t in tables_of("dofp-imx250mzr", public_files("dofp-imx250mzr")) if t.name == "camera")
+    picture = cv2.imread(camera.rows[0].split(",")[1], cv2.IMREAD_UNCHANGED)
     top, left = (picture.shape[0] - 600) // 2, (picture.shape[1] - 800) // 2
     cv2.imwrite(str(tmp_path / "middle.png"), picture[top : top + 600, left : left + 800])
     instrument = configs / "instruments/linear_stokes.yaml"
-    path = imported(tmp_path, replace(whole, rows=(f"0,{tmp_path / 'middle.png'}",)), instrument)
+    path = imported(tmp_path, replace(camera, rows=(f"0,{tmp_path / 'middle.png'}",)), instrument)
     d = diagnose_captures([path], InstrumentModel.load(instrument))[0].diagnosis
     assert d.captures[0].dark_fraction < 0.5
     assert d.noise_floor_percent < 20

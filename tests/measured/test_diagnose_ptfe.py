@@ -41,12 +41,12 @@ class ReflectanceProblem:
 
     def pool(self):
         """All effects of the reflectance; a diffuse weight of either sign is a separate valley."""
-        found = []
+        candidates = []
         for effect in reflectance_effects().values():
             parameters = effect.parameters("")
             first = np.array([p.typical if k == 0 else 0.0 for k, p in enumerate(parameters)])
-            found.append(Candidate(effect, "", parameters, None, (first, -first)))
-        return tuple(found)
+            candidates.append(Candidate(effect, "", parameters, None, (first, -first)))
+        return tuple(candidates)
 
     def powers(self):
         """Structure can differ from point to point; a twentieth of the points are taken as independent."""
@@ -93,8 +93,8 @@ class ReflectanceProblem:
             change = -np.einsum("nli,ni->nl", (self._columns(space, moved) - a) / step, alpha)
             d[j] = change - np.einsum("nlr,nr->nl", q, np.einsum("nlr,nl->nr", q, change))
         for fold in range(self.folds if k else 0):
-            here = d[:, self.fold == fold].reshape(k, -1)
-            out.gradient[fold], out.curvature[fold] = here @ r[self.fold == fold].reshape(-1), here @ here.T
+            slopes = d[:, self.fold == fold].reshape(k, -1)
+            out.gradient[fold], out.curvature[fold] = slopes @ r[self.fold == fold].reshape(-1), slopes @ slopes.T
         return out
 
 
@@ -128,13 +128,13 @@ def test_a_fitted_index_runs_to_its_bound(public_files, wavelength_um):
     problem = problem_of(public_files, wavelength_um)
     (index,) = (c for c in problem.pool() if c.kind == "refractive_index")
     free = replace(index, parameters=(replace(index.parameters[0], lower=-0.34), index.parameters[1]))
-    left = {}
+    residual = {}
     for name, candidate in (("bounded", index), ("free", free)):
         space = Space((candidate,))
         fit = minimize(problem, space, np.zeros(2))
         # PTFE's own index is 1.35; the fit asks for that of nothing at all (1.01), which is no surface.
         assert fit.values[0] == pytest.approx(candidate.lower[0], abs=1e-3)
-        left[name] = 100 * held_out(problem, space, fit).rms
+        residual[name] = 100 * held_out(problem, space, fit).rms
     # It helps on directions that it has not seen, as a dipole's ratio of amplitudes does, which it imitates there.
-    assert left["free"] < left["bounded"] < FOUND[wavelength_um][0]
-    assert left["free"] == pytest.approx(INDEX[wavelength_um], abs=0.01)
+    assert residual["free"] < residual["bounded"] < FOUND[wavelength_um][0]
+    assert residual["free"] == pytest.approx(INDEX[wavelength_um], abs=0.01)

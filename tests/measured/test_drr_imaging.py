@@ -71,9 +71,9 @@ def test_mirror_gives_the_train(public_files, configs: Path, tmp_path: Path) -> 
     with Capture(path) as capture:
         assert len(capture.role) == 512
         result = fit_trains([part_of(capture, model, slice(150, 330), slice(150, 490))], FREE)[0]
-    found = dict(zip(result.names, result.values, strict=True))
-    assert found["psg_retarder.retardance_deg"] == pytest.approx(72.4, abs=0.1)
-    assert found["psa_retarder.retardance_deg"] == pytest.approx(72.4, abs=0.1)
+    train = dict(zip(result.names, result.values, strict=True))
+    assert train["psg_retarder.retardance_deg"] == pytest.approx(72.4, abs=0.1)
+    assert train["psa_retarder.retardance_deg"] == pytest.approx(72.4, abs=0.1)
     assert result.residual_over_mean == pytest.approx(0.014, abs=0.0005)
     # The authors' own fit of the same frames: zeros are subtracted there, and modulo 90 degrees for a retarder.
     theirs = scipy.io.loadmat(str(files["calibration_reflexion.mat"]))
@@ -82,9 +82,9 @@ def test_mirror_gives_the_train(public_files, configs: Path, tmp_path: Path) -> 
         ("psg_retarder.azimuth_deg", "alpha_0_g", 90),
         ("psa_retarder.azimuth_deg", "alpha_0_a", 90),
     ):
-        difference = (found[name] + theirs[key].item() + period / 2) % period - period / 2
+        difference = (train[name] + theirs[key].item() + period / 2) % period - period / 2
         assert abs(difference) < 0.2, name
     for name, end in (("psg", "g"), ("psa", "a")):
         k1, k2 = theirs[f"k_1_{end}"].item(), theirs[f"k_2_{end}"].item()
         expected = np.rad2deg(k1 / 630 + k2 / 630**3)
-        assert found[f"{name}_retarder.retardance_deg"] == pytest.approx(expected, abs=0.3)
+        assert train[f"{name}_retarder.retardance_deg"] == pytest.approx(expected, abs=0.3)

@@ -138,9 +138,9 @@ def test_eigenvalues_over_all_geometries(table: np.ndarray, um: float) -> None:
 def test_the_picture_of_the_page(table: np.ndarray, tmp_path: Path) -> None:
     figure(table, tmp_path / "made.png")
     page = Path(__file__).parents[2] / "docs/images/ptfe_quantities.png"
-    made, shown = (cv2.imread(str(path)).astype(int) for path in (tmp_path / "made.png", page))
+    picture, shown = (cv2.imread(str(path)).astype(int) for path in (tmp_path / "made.png", page))
     # Fonts differ a little from one version of the drawing library to the next, curves do not.
-    assert np.abs(made - shown).mean() < 1
+    assert np.abs(picture - shown).mean() < 1
 
 
 @pytest.mark.parametrize("um", FOUND)
@@ -169,8 +169,8 @@ def test_reciprocity(table: np.ndarray, um: float) -> None:
     reciprocal = rms(m[pair] - RECIPROCAL @ back @ RECIPROCAL)
     noise = np.sqrt(2 * np.mean(noise_of_elements(m, *geometry)[pair] ** 2))
     assert reciprocal < 1.1 * noise
-    for other in (np.eye(4), np.diag([1.0, 1.0, -1.0, -1.0]), np.diag([1.0, 1.0, 1.0, -1.0])):
-        assert rms(m[pair] - other @ back @ other) > 1.25 * reciprocal
+    for signs in (np.eye(4), np.diag([1.0, 1.0, -1.0, -1.0]), np.diag([1.0, 1.0, 1.0, -1.0])):
+        assert rms(m[pair] - signs @ back @ signs) > 1.25 * reciprocal
     assert rms(m[pair] - m[row[pair]]) > 1.25 * reciprocal
     # In the file's own axes of the reflected beam it does not hold.
     raw = np.concatenate([np.ones((1824, 1)), table[table[:, 0] == um][:, 6:]], axis=1).reshape(-1, 4, 4)

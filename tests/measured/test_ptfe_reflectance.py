@@ -41,8 +41,8 @@ def explained(m: np.ndarray, model: np.ndarray) -> float:
     """Part of the squared polarized elements of M/m00 that the best multiple of the model's takes, all geometries."""
     polarized, shape = (x.reshape(-1, 16)[:, 1:] for x in (m, model))
     share = np.sum(polarized * shape, axis=1, keepdims=True) / np.sum(shape**2, axis=1, keepdims=True)
-    left = polarized - np.maximum(share, 0) * shape
-    return float(1 - np.sum(left**2) / np.sum(polarized**2))
+    residual = polarized - np.maximum(share, 0) * shape
+    return float(1 - np.sum(residual**2) / np.sum(polarized**2))
 
 
 #: On these data (docs/studies/reflectance.md): the dominant process of the pixel, the fitted model, and Fresnel
@@ -61,10 +61,10 @@ def test_how_much_of_the_polarized_light_the_model_takes(rows, wavelength_um):
     every = np.tile(np.eye(16), (len(m), 1, 1))
     fit = fit_values(geometry, m.reshape(-1, 16).T, np.eye(16), every, max_pixels=len(m), correlation=True)
     best = explained(m, fit.model("PTFE", 1000 * wavelength_um).mueller_jones(geometry, 1000 * wavelength_um))
-    own = explained(m, xi0_and_dominant(m)[1])
+    fraction = explained(m, xi0_and_dominant(m)[1])
     plain = first_surface.Model(name="PTFE", constants={633: first_surface.Constants(n=1.35)})
     fresnel = explained(m, plain.mueller_jones(geometry, 633))
-    assert (own, best, fresnel) == pytest.approx(FOUND[wavelength_um], abs=0.01)
+    assert (fraction, best, fresnel) == pytest.approx(FOUND[wavelength_um], abs=0.01)
     assert best == pytest.approx(1 - fit.residual**2, abs=1e-6)
     # Towards n = 1 the ratio r_p/r_s becomes that of a dipole, cos(2 theta_d): volume scattering, no surface.
     assert fit.constants[0] == pytest.approx(1.01, abs=1e-3)

@@ -33,24 +33,24 @@ def product(public_files, configs: Path, tmp_path_factory: pytest.TempPathFactor
 def maps(product: Path, place: tuple[slice, slice]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Every default map of a part of the image, and its standard errors."""
     rows, columns = place
-    whole = MuellerImage.load(product, rows)
+    full = MuellerImage.load(product, rows)
     image = replace(
-        whole,
-        values=whole.values[..., columns],
-        errors=whole.errors[..., columns],
-        mask=whole.mask[:, columns],
-        residual_rms=whole.residual_rms[:, columns],
+        full,
+        values=full.values[..., columns],
+        errors=full.errors[..., columns],
+        mask=full.mask[:, columns],
+        residual_rms=full.residual_rms[:, columns],
     )
     m = image.matrices.astype(float)
-    found = {}
+    derived_maps = {}
     groups = [gradients.coherency, gradients.depolarization_index, gradients.diattenuation, gradients.polarizance]
     groups += [gradients.dominant, gradients.lu_chipman_quantities, lambda x: gradients.pairs(x, PAPER_PAIRS)]
     for group in groups:
         for name, derived in group(m).items():
             gradients_of_each = derived.gradient.reshape(-1, *m.shape[:2], 16)
             errors = np.sqrt(np.stack([image.variance_of(g) for g in gradients_of_each]))
-            found[name] = derived.value, errors.reshape(derived.value.shape)
-    return found
+            derived_maps[name] = derived.value, errors.reshape(derived.value.shape)
+    return derived_maps
 
 
 def test_discs_stand_out_of_the_background(product: Path) -> None:
