@@ -21,20 +21,27 @@ def bench_capture(
     seed: int = 7,
     *,
     scene=None,
-    told=None,
+    report_angles=None,
 ) -> Path:
-    """A capture file of so many states of the instrument `file`: of air, which it tells, or of an unknown sample.
+    """A capture file of so many states of the instrument `file`: of air, which it states, or of an unknown sample.
 
-    `scene` makes another scene of a random generator; `told` changes the angles that the file tells.
+    `scene` makes another scene of a random generator; `report_angles` changes the angles that the file states.
     """
     random = np.random.default_rng(seed)
     angles = state_angles(states, bench.mosaic, bench.zigzag)
-    seen = scene(random) if scene else TrueScene(random, np.eye(4) if air else None)
-    counts = digitize(bench, expose(bench, seen, angles), random)
+    sample_scene = scene(random) if scene else TrueScene(random, np.eye(4) if air else None)
+    counts = digitize(bench, expose(bench, sample_scene, angles), random)
     sample = Sample(kind="air" if air else "unknown")
     folder.mkdir(exist_ok=True)
     path = folder / "capture.h5"
-    write_capture(path, bench, counts, told(angles) if told else angles, sample=sample, instrument=file.read_text())
+    write_capture(
+        path,
+        bench,
+        counts,
+        report_angles(angles) if report_angles else angles,
+        sample=sample,
+        instrument=file.read_text(),
+    )
     return path
 
 

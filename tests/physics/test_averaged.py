@@ -24,14 +24,14 @@ def test_noise_of_means_is_as_told():
     mixed = 0.7 * white[:, :, :-1] + 0.3 * white[:, :, 1:]
     mixed = 0.9 * mixed[:, :-1] + 0.1 * mixed[:, 1:]
     data = replace(steady_capture(0.5 + mixed, SIGMA), shared=SharedNoise(right=0.3, down=0.1))
-    found = averaged(data, SIDE)
-    left = found.signal[:, 0] - 0.5
-    across, down = found.shared.right * (1 - found.shared.right), found.shared.down * (1 - found.shared.down)
-    assert np.var(left) == pytest.approx(found.floor[0] * found.shared.shown, rel=0.02)
-    right = np.mean(left[:, :, :-1] * left[:, :, 1:])
-    assert right == pytest.approx(found.floor[0] * across * (1 - 2 * down), rel=0.1)
-    below = np.mean(left[:, :-1] * left[:, 1:])
-    assert below == pytest.approx(found.floor[0] * down * (1 - 2 * across), rel=0.2)
+    means = averaged(data, SIDE)
+    noise = means.signal[:, 0] - 0.5
+    across, down = means.shared.right * (1 - means.shared.right), means.shared.down * (1 - means.shared.down)
+    assert np.var(noise) == pytest.approx(means.floor[0] * means.shared.shown, rel=0.02)
+    right = np.mean(noise[:, :, :-1] * noise[:, :, 1:])
+    assert right == pytest.approx(means.floor[0] * across * (1 - 2 * down), rel=0.1)
+    below = np.mean(noise[:, :-1] * noise[:, 1:])
+    assert below == pytest.approx(means.floor[0] * down * (1 - 2 * across), rel=0.2)
 
 
 def test_offsets_of_lines_weigh_more_beside_means():
@@ -39,21 +39,21 @@ def test_offsets_of_lines_weigh_more_beside_means():
     noise = random.normal(0, SIGMA, (6, 240, 240)) + random.normal(0, 0.3 * SIGMA, (6, 240, 1))
     wide = 1 + 0.09 * 240
     data = steady_capture(noise, SIGMA * np.sqrt(wide))
-    found = averaged(replace(data, shared=SharedNoise(rows=0.09), wide=np.full(6, wide)), SIDE)
-    pixel = found.floor[0] / wide
-    rows = found.signal[:, 0].mean(axis=2)
-    assert np.var(rows) - pixel / 80 == pytest.approx(found.shared.rows * pixel, rel=0.15)
-    np.testing.assert_array_equal(found.wide, wide)
+    means = averaged(replace(data, shared=SharedNoise(rows=0.09), wide=np.full(6, wide)), SIDE)
+    pixel = means.floor[0] / wide
+    rows = means.signal[:, 0].mean(axis=2)
+    assert np.var(rows) - pixel / 80 == pytest.approx(means.shared.rows * pixel, rel=0.15)
+    np.testing.assert_array_equal(means.wide, wide)
 
 
 def test_a_square_counts_if_all_its_pixels_do():
     data = steady_capture(np.ones((2, 7, 6)), SIGMA)
     data.usable[3, 1], data.clipped[0, 5] = False, True
-    found = averaged(data, SIDE)
-    assert found.signal.shape == (2, 1, 2, 2)
-    assert found.usable.tolist() == [[True, True], [False, True]]
-    assert found.clipped.tolist() == [[False, True], [False, False]]
-    assert (found.binned, found.pitch) == (SIDE, SIDE)
+    means = averaged(data, SIDE)
+    assert means.signal.shape == (2, 1, 2, 2)
+    assert means.usable.tolist() == [[True, True], [False, True]]
+    assert means.clipped.tolist() == [[False, True], [False, False]]
+    assert (means.binned, means.pitch) == (SIDE, SIDE)
 
 
 @pytest.fixture(scope="module")
@@ -64,13 +64,13 @@ def fitted(configs, tmp_path_factory):
     bench.shift.append(lambda k, a: (0.02 * k, -0.01 * k))
     file = configs / "instruments/rgb950.yaml"
     model, data = read(bench_capture(tmp_path_factory.mktemp("averaged"), file, bench, states=24), file)
-    found = []
+    fits = []
     for each in (data, averaged(data, 2)):
         problem = InstrumentProblem(model, [each])
         space = Space(tuple(c for c in problem.pool() if c.kind in ("psa_azimuth", "image_drift")))
         fit = minimize(problem, space, np.zeros(space.size))
-        found.append((fit.values, np.sqrt(np.diag(np.linalg.inv(fit.sums.curvature.sum(axis=0))))))
-    return found
+        fits.append((fit.values, np.sqrt(np.diag(np.linalg.inv(fit.sums.curvature.sum(axis=0))))))
+    return fits
 
 
 def test_means_say_what_the_pixels_say(fitted):

@@ -71,9 +71,10 @@ def bench(configs, *faults):
     ), model.at(662.0)
 
 
-def series(made):
+def series(true_bench):
     shots = [
-        made.expected_electrons({a: float(v[k]) for a, v in ANGLES.items()}, 1.0, k) for k in range(len(ANGLES["psg"]))
+        true_bench.expected_electrons({a: float(v[k]) for a, v in ANGLES.items()}, 1.0, k)
+        for k in range(len(ANGLES["psg"]))
     ]
     return np.stack(shots).astype(float)
 
@@ -83,20 +84,20 @@ PRESENT = [case for case in CASES if case[1] in instrument_effects()]
 
 @pytest.mark.parametrize(("fault", "kind", "place", "values"), PRESENT, ids=[f"{c[0]['kind']}-{c[1]}" for c in PRESENT])
 def test_fault_is_the_effect(configs, fault, kind, place, values):
-    made, model = bench(configs, fault)
+    true_bench, model = bench(configs, fault)
     changes = Changes(Conditions.of(ANGLES))
     effect = instrument_effects()[kind]
     effect.apply(changes, model, place, np.array(values, dtype=float))
     want = 1e4 * model.rows(ANGLES, changes)[:, 0] @ GLASS.reshape(16)
-    got = series(made)[:, 0, 0]
+    got = series(true_bench)[:, 0, 0]
     plain = series(bench(configs)[0])[:, 0, 0]
     assert np.abs(got - plain).max() > 1e-3 * plain.max()
     np.testing.assert_allclose(got, want, rtol=2e-5, atol=2e-5 * plain.max())
 
 
 def test_field_retardance_is_another_retarder_in_every_pixel(configs):
-    made, _ = bench(configs, {"kind": "field_retardance", "element": "psg_retarder", "edge_deg": 3.0, "x": 0.5})
-    image = series(made)
+    true_bench, _ = bench(configs, {"kind": "field_retardance", "element": "psg_retarder", "edge_deg": 3.0, "x": 0.5})
+    image = series(true_bench)
     for row, column in ((0, 0), (4, 8), (8, 3)):
         x, y = -1 + column / 4, -1 + row / 4
         offset = 3.0 * ((x - 0.5) ** 2 + y**2)
@@ -105,8 +106,8 @@ def test_field_retardance_is_another_retarder_in_every_pixel(configs):
 
 
 def test_play_is_taken_up_before_the_shaft_follows(configs):
-    made, _ = bench(configs, {"kind": "angle_play", "axis": "psg", "play_deg": 0.5})
-    (fault,) = made.effects
+    true_bench, _ = bench(configs, {"kind": "angle_play", "axis": "psg", "play_deg": 0.5})
+    (fault,) = true_bench.effects
     turned = [fault.angles({"psg": a}, None)["psg"] for a in (10.0, 20.0, 20.6, 20.2, 15.0)]
     np.testing.assert_allclose(turned, [9.5, 19.5, 20.1, 20.1, 15.5])
 
@@ -123,6 +124,6 @@ def test_counts_are_bent_and_lifted(configs):
 
 def test_channel_and_element_must_exist(configs):
     for fault in ({"kind": "channel_error", "channel": "no"}, {"kind": "window", "behind": "no"}):
-        made, _ = bench(configs, fault)
+        true_bench, _ = bench(configs, fault)
         with pytest.raises(KeyError, match="has no"):
-            series(made)
+            series(true_bench)

@@ -27,12 +27,12 @@ def test_a_bend_beside_other_faults_is_not_taken_for_several(configs: Path, tmp_
     bench.fast_slow_g = (1.0, 0.995)
     bench.level.append(lambda k, angles: 1 - 0.004 * k / STATES)
     path = bench_capture(tmp_path, file, bench, seed=2, scene=RoundSample)
-    found = diagnose_captures([path], InstrumentModel.load(file))[0].diagnosis
-    told = {effect.kind: effect for effect in found.effects}
-    assert set(told) == {"detector_nonlinearity", "retarder_diattenuation", "source_drift"}
-    assert told["retarder_diattenuation"].answer == told["source_drift"].answer == "sure"
+    diagnosis = diagnose_captures([path], InstrumentModel.load(file))[0].diagnosis
+    effects = {effect.kind: effect for effect in diagnosis.effects}
+    assert set(effects) == {"detector_nonlinearity", "retarder_diattenuation", "source_drift"}
+    assert effects["retarder_diattenuation"].answer == effects["source_drift"].answer == "sure"
     # A tone curve of its own size can do as well; which of the two it is one picture of a sphere need not tell.
-    bend = told["detector_nonlinearity"]
+    bend = effects["detector_nonlinearity"]
     assert bend.confident
     assert set(bend.indistinguishable_from) <= {"tone_curve"}
     lost = bend.parameters["lost_at_full_scale"]

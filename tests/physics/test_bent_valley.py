@@ -18,12 +18,12 @@ class Valley:
     """Each of two parts asks that y = x^2, and that x is 3 or -3."""
 
     folds, noise_known, holds_out_states, spread = 2, True, False, 1.0
-    wanted, steep = (3.0, -3.0), 3.0
+    targets, steep = (3.0, -3.0), 3.0
 
     def sums(self, space: Space, values: np.ndarray, *, derivatives: bool = True) -> Sums:
         x, y = values
         out = Sums.empty(2, 2 if derivatives else 0)
-        for fold, at in enumerate(self.wanted):
+        for fold, at in enumerate(self.targets):
             residual = np.array([self.steep * (y - x * x), x - at])
             slopes = np.array([[-2 * self.steep * x, self.steep], [1.0, 0.0]])
             out.excess[fold], out.freedom[fold] = residual @ residual, 1.0
@@ -54,14 +54,14 @@ def space() -> Space:
 def test_what_is_held_out_is_predicted_by_a_fit_and_not_by_one_step_off_the_valley(space):
     problem, start = Valley(), np.zeros(2)
     sums = problem.sums(space, start)
-    found = held_out(problem, space, Fit(start, sums, float(sums.excess.sum())), np.full(2, 1e-6))
+    check = held_out(problem, space, Fit(start, sums, float(sums.excess.sum())), np.full(2, 1e-6))
     # A part that asks for 3 is predicted from one that asks for -3; one step would leave 2 (3 x 9)^2.
-    assert found.excess == pytest.approx(2 * 6.0**2, rel=0.05)
+    assert check.excess == pytest.approx(2 * 6.0**2, rel=0.05)
 
 
 def test_a_mean_off_the_valley_gives_way_to_the_minimum_near_by(space):
     problem, about = Valley(), np.array([1.0, 1.0])
-    problem.wanted, problem.steep = (3.0, 3.0), 30.0
+    problem.targets, problem.steep = (3.0, 3.0), 30.0
     form = quadratic(problem, space, about, problem.sums(space, about))
     sets = Sets(form, [Group(np.array([0])), Group(np.array([1]))], Noise(True, 2.0))
     state = State(np.full(2, 3.0))
@@ -69,5 +69,5 @@ def test_a_mean_off_the_valley_gives_way_to_the_minimum_near_by(space):
     samples = SimpleNamespace(mean=fit.mean, covariance=fit.covariance, probability=np.ones(2), best=state)
     off, on = (problem.sums(space, v).excess.sum() for v in (fit.mean, about))
     assert off > 10 * on
-    found = _posterior_of(problem, space, ((0,), (1,)), sets, samples=samples, about=about, rivals={})
-    assert problem.sums(space, found.values).excess.sum() < on
+    posterior = _posterior_of(problem, space, ((0,), (1,)), sets, samples=samples, about=about, rivals={})
+    assert problem.sums(space, posterior.values).excess.sum() < on

@@ -21,9 +21,9 @@ def capture(offset, misfit):
     return steady_capture(signal, SIGMA)
 
 
-@pytest.mark.parametrize(("offset", "misfit", "found"), [(0.0, 0.0, False), (0.0, 0.2, False), (3e-4, 0.0, True)])
-def test_an_offset_is_the_same_in_darker_and_brighter_dim_pixels(offset, misfit, found):
-    assert (black_jitter(capture(offset, misfit), np.ones((STATES, 1))) is not None) == found
+@pytest.mark.parametrize(("offset", "misfit", "is_jitter"), [(0.0, 0.0, False), (0.0, 0.2, False), (3e-4, 0.0, True)])
+def test_an_offset_is_the_same_in_darker_and_brighter_dim_pixels(offset, misfit, is_jitter):
+    assert (black_jitter(capture(offset, misfit), np.ones((STATES, 1))) is not None) == is_jitter
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -46,9 +46,9 @@ def test_a_drift_in_whole_counts_leaves_its_steps():
     """The drift is a fault and stays for the fit; the steps beside it belong to no cause."""
     drift = 8 * np.arange(STATES) / (STATES - 1)
     data = steady_capture(in_counts(np.rint(drift), 1.0), 1.0 / 4095)
-    found = black_jitter(data, np.ones((STATES, 1)))
-    assert found is not None
-    left = np.rint(drift) - 4095 * found[0]
-    line = np.polyval(np.polyfit(drift, left, 1), drift)
-    assert np.std(left - line) < np.std(np.rint(drift) - drift) / 2
+    jitter = black_jitter(data, np.ones((STATES, 1)))
+    assert jitter is not None
+    steps = np.rint(drift) - 4095 * jitter[0]
+    line = np.polyval(np.polyfit(drift, steps, 1), drift)
+    assert np.std(steps - line) < np.std(np.rint(drift) - drift) / 2
     assert np.ptp(line) == pytest.approx(8, abs=0.5)

@@ -51,13 +51,13 @@ with one_blas_thread():
 print(threads(), os.environ["OPENBLAS_NUM_THREADS"])
 """
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "2"}
-    told = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert told.stdout.splitlines() == ["False {1}", "{1}", "{2} 2"]
+    process = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert process.stdout.splitlines() == ["False {1}", "{1}", "{2} 2"]
 
 
 def test_a_diagnosis_called_from_python_holds_blas_to_one_thread(configs, tmp_path):
-    seen = []
+    threads = []
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     with threadpool_limits(limits=2, user_api="blas"), pytest.raises(CaptureError):
-        diagnose_captures([tmp_path / "missing.h5"], model, lambda line: seen.append(_blas_threads()))
-    assert seen == [{1}]
+        diagnose_captures([tmp_path / "missing.h5"], model, lambda line: threads.append(_blas_threads()))
+    assert threads == [{1}]

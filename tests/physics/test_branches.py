@@ -35,20 +35,20 @@ def two_starts(name, folder, plates, by_deg):
     true = turned(nominal, psg_retarder=3.0, psa_retarder=-2.0)
     file = folder / f"{name}.yaml"
     file.write_text(dump_yaml(nominal))
-    air, other = (
+    air, sample = (
         emulated_capture(true, bench, m, kind, file=file, random=random)
         for m, kind in ((np.eye(4), "air"), (SAMPLE, "unknown"))
     )
-    found, products = [], []
+    diagnoses, products = [], []
     for by in (0.0, by_deg):
         model, new = turned(nominal, **dict.fromkeys(plates, by)), folder / f"{name}_{by:g}.yaml"
-        found.append(diagnose_captures([air], model)[0].diagnosis)
-        write_instrument(new, model, found[-1])
-        products.append(relative(means_of(Reduction(other, new).make(new.with_suffix(".h5"), True))))
-    first, second = ({key: value.stderr for key, value in d.calibrated.items()} for d in found)
+        diagnoses.append(diagnose_captures([air], model)[0].diagnosis)
+        write_instrument(new, model, diagnoses[-1])
+        products.append(relative(means_of(Reduction(sample, new).make(new.with_suffix(".h5"), True))))
+    first, second = ({key: value.stderr for key, value in d.calibrated.items()} for d in diagnoses)
     ratios = [second[key] / first[key] for key in first]
     m = np.array([values.reshape(4, 4) for values, _ in products])
-    return m, products[0][1].reshape(4, 4), max(max(r, 1 / r) for r in ratios), found[1].branch
+    return m, products[0][1].reshape(4, 4), max(max(r, 1 / r) for r in ratios), diagnoses[1].branch
 
 
 @pytest.mark.long

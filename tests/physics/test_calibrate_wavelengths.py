@@ -56,22 +56,22 @@ def parts_of(captures, model):
 
 def test_mounts_are_shared_and_plates_are_not(captures, configs):
     parts = parts_of(captures, InstrumentModel.load(configs / "instruments/rgb950.yaml"))
-    found = fit_trains(parts, FREE)
-    for (nm, off), part, fit in zip(OFF_DEG.items(), parts, found, strict=True):
+    fits = fit_trains(parts, FREE)
+    for (nm, off), part, fit in zip(OFF_DEG.items(), parts, fits, strict=True):
         nominal = {e.name: e for e in part.model.elements()}
         change = fit.values - [getattr(nominal[name.split(".")[0]], name.split(".")[1]) for name in FREE]
         assert np.abs((change - [TURNED_DEG, *off]) / fit.stderr).max() < 4, nm
-        assert change[0] == pytest.approx(found[0].values[0] + 17.02, abs=1e-9)
+        assert change[0] == pytest.approx(fits[0].values[0] + 17.02, abs=1e-9)
     # Three captures know the mount better than one.
-    assert found[0].stderr[0] < 0.75 * fit_trains(parts[:1], FREE)[0].stderr[0]
+    assert fits[0].stderr[0] < 0.75 * fit_trains(parts[:1], FREE)[0].stderr[0]
 
 
 def test_what_the_file_says_of_an_axis_that_turns_with_the_wavelength_holds(captures, configs):
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     declared = model.model_copy(update={"belongs_to": {"psg_retarder.azimuth_deg": "dispersion"}})
-    found = fit_trains(parts_of(captures, declared), FREE)
-    assert len({float(fit.values[0]) for fit in found}) == len(captures)
-    assert found[0].stderr[0] == pytest.approx(fit_trains(parts_of(captures[:1], model), FREE)[0].stderr[0], rel=0.1)
+    fits = fit_trains(parts_of(captures, declared), FREE)
+    assert len({float(fit.values[0]) for fit in fits}) == len(captures)
+    assert fits[0].stderr[0] == pytest.approx(fit_trains(parts_of(captures[:1], model), FREE)[0].stderr[0], rel=0.1)
 
 
 def test_command_writes_all_wavelengths(captures, configs, tmp_path):
@@ -93,5 +93,5 @@ def test_a_source_that_flickers_does_not_move_the_values_of_two_channels(configs
     true = model.with_values({"psg_retarder": {"azimuth_deg": 3.0}, "psa_retarder": {"retardance_deg": 94.0}})
     angles, random = {"psg": 4.0 * np.arange(46)}, np.random.default_rng(1)
     signal = true.rows(angles) @ np.eye(4).reshape(16) * random.uniform(0.8, 1.2, (46, 1))
-    (found,) = fit_trains([KnownCapture(model, angles, signal, np.eye(4))], ["psg_retarder.azimuth_deg", FREE[2]])
-    assert found.values == pytest.approx([3.0, 94.0], abs=1e-5)
+    (fit,) = fit_trains([KnownCapture(model, angles, signal, np.eye(4))], ["psg_retarder.azimuth_deg", FREE[2]])
+    assert fit.values == pytest.approx([3.0, 94.0], abs=1e-5)

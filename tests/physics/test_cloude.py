@@ -72,8 +72,8 @@ def test_triply_degenerate_matrix() -> None:
     for xi0 in (0.26, 0.5, 0.99, 1.0):
         m = 7.0 * 4 / 3 * ((xi0 - 0.25) * m0 + (1 - xi0) * mueller.IDEAL_DEPOLARIZER)
         np.testing.assert_allclose(coherency_eigenvalues(m), [xi0, *3 * [(1 - xi0) / 3]], atol=1e-14)
-        found, dominant = xi0_and_dominant(m)
-        np.testing.assert_allclose(found, xi0, atol=1e-14)
+        estimate, dominant = xi0_and_dominant(m)
+        np.testing.assert_allclose(estimate, xi0, atol=1e-14)
         np.testing.assert_allclose(dominant, m0, atol=1e-12)
 
 
@@ -148,20 +148,20 @@ def test_turning_the_frames_turns_the_dominant_process_and_keeps_xi0(seed: int, 
 def test_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UMOV_THREADS", "3")
     assert thread_count() == 3
-    seen = np.zeros(20_001, dtype=int)
+    visits = np.zeros(20_001, dtype=int)
 
     def loop(start: int, stop: int) -> None:
-        seen[start:stop] += 1
+        visits[start:stop] += 1
 
-    for_ranges(seen.size, loop)
-    assert (seen == 1).all()
+    for_ranges(visits.size, loop)
+    assert (visits == 1).all()
 
     def fails(start: int, stop: int) -> None:
         if start:
             raise ArithmeticError("in a thread")
 
     with pytest.raises(ArithmeticError, match="in a thread"):
-        for_ranges(seen.size, fails)
+        for_ranges(visits.size, fails)
     monkeypatch.setenv("UMOV_THREADS", "none")
     with pytest.raises(ValueError, match="UMOV_THREADS='none'"):
         thread_count()

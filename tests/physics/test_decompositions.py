@@ -36,8 +36,8 @@ Array = NDArray[np.float64]
 
 @pytest.fixture(scope="module")
 def peers() -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((Path(__file__).parent / "peer_decompositions.json").read_text())
-    return found
+    results: dict[str, Any] = json.loads((Path(__file__).parent / "peer_decompositions.json").read_text())
+    return results
 
 
 class TestOthersPackages:
@@ -89,32 +89,32 @@ class TestOthersPackages:
 class TestLuChipman:
     def test_factors_are_what_they_say_and_give_m_back(self) -> None:
         m = random_mueller(4000, seed=1)
-        found = lu_chipman(m)
-        assert found.defined.all()
-        np.testing.assert_array_equal(found.negative_determinant, np.linalg.det(m) < 0)
-        assert 10 < found.negative_determinant.sum() < 400
-        rebuilt = found.depolarizer @ found.retarder @ found.diattenuator
+        factors = lu_chipman(m)
+        assert factors.defined.all()
+        np.testing.assert_array_equal(factors.negative_determinant, np.linalg.det(m) < 0)
+        assert 10 < factors.negative_determinant.sum() < 400
+        rebuilt = factors.depolarizer @ factors.retarder @ factors.diattenuator
         np.testing.assert_allclose(rebuilt, m, atol=1e-11 * m.max())
-        r = found.retarder[:, 1:, 1:]
+        r = factors.retarder[:, 1:, 1:]
         np.testing.assert_allclose(r @ np.swapaxes(r, 1, 2), np.broadcast_to(np.eye(3), r.shape), atol=1e-13)
         np.testing.assert_allclose(np.linalg.det(r), 1, atol=1e-13)
-        np.testing.assert_array_equal(found.depolarizer[:, 0], np.broadcast_to([1, 0, 0, 0], (len(m), 4)))
-        block = found.depolarizer[:, 1:, 1:]
+        np.testing.assert_array_equal(factors.depolarizer[:, 0], np.broadcast_to([1, 0, 0, 0], (len(m), 4)))
+        block = factors.depolarizer[:, 1:, 1:]
         np.testing.assert_array_equal(block, np.swapaxes(block, 1, 2))
         axes = np.linalg.eigvalsh(block)
-        assert (np.where(found.negative_determinant[:, None], -axes, axes) > -1e-12).all()
-        np.testing.assert_allclose(found.diattenuator, np.swapaxes(found.diattenuator, 1, 2))
-        np.testing.assert_allclose(coherency_eigenvalues(found.diattenuator)[:, 0], 1, atol=1e-10)
+        assert (np.where(factors.negative_determinant[:, None], -axes, axes) > -1e-12).all()
+        np.testing.assert_allclose(factors.diattenuator, np.swapaxes(factors.diattenuator, 1, 2))
+        np.testing.assert_allclose(coherency_eigenvalues(factors.diattenuator)[:, 0], 1, atol=1e-10)
 
     def test_known_products(self) -> None:
         retarder = mueller.retarder(0.3, 2.0) @ mueller.rotation(0.2)
         diattenuator = mueller.diattenuator(1.1, 0.9, 0.2)
         depolarizer = np.array([[1, 0, 0, 0], [0.1, 0.5, 0.1, 0], [0.05, 0.1, 0.4, 0], [0, 0, 0, 0.3]])
-        found = lu_chipman(depolarizer @ retarder @ diattenuator)
-        np.testing.assert_allclose(found.depolarizer, depolarizer, atol=1e-13)
-        np.testing.assert_allclose(found.retarder, retarder, atol=1e-13)
-        np.testing.assert_allclose(found.diattenuator, diattenuator, atol=1e-13)
-        np.testing.assert_allclose(depolarization_power(found.depolarizer), 1 - 1.2 / 3)
+        factors = lu_chipman(depolarizer @ retarder @ diattenuator)
+        np.testing.assert_allclose(factors.depolarizer, depolarizer, atol=1e-13)
+        np.testing.assert_allclose(factors.retarder, retarder, atol=1e-13)
+        np.testing.assert_allclose(factors.diattenuator, diattenuator, atol=1e-13)
+        np.testing.assert_allclose(depolarization_power(factors.depolarizer), 1 - 1.2 / 3)
 
     def test_depolarization_does_not_lower_the_retardance(self) -> None:
         # docs/conventions.md, "Below a quarter"
@@ -126,20 +126,20 @@ class TestLuChipman:
     def test_where_it_is_not_defined(self) -> None:
         nothing = np.full((4, 4), np.nan)
         cases = np.stack([mueller.polarizer(0.3), mueller.IDEAL_DEPOLARIZER, np.zeros((4, 4)), nothing, np.eye(4)])
-        found = lu_chipman(cases)
-        np.testing.assert_array_equal(found.defined, [False, False, False, False, True])
-        assert np.isnan(found.retarder[:4]).all()
-        assert np.isnan(found.depolarizer[:4]).all()
-        assert not found.negative_determinant[:4].any()
+        factors = lu_chipman(cases)
+        np.testing.assert_array_equal(factors.defined, [False, False, False, False, True])
+        assert np.isnan(factors.retarder[:4]).all()
+        assert np.isnan(factors.depolarizer[:4]).all()
+        assert not factors.negative_determinant[:4].any()
         # The ideal depolarizer has a diattenuator all the same.
-        np.testing.assert_allclose(found.diattenuator[1], np.eye(4))
+        np.testing.assert_allclose(factors.diattenuator[1], np.eye(4))
 
     def test_nearly_singular_depolarizers(self) -> None:
         retarder = mueller.retarder(0.7, 2.9) @ mueller.rotation(-0.5)
         depolarizer = np.diag([1.0, 0.5, 1e-6, 1e-3])
-        found = lu_chipman(depolarizer @ retarder)
-        np.testing.assert_allclose(found.retarder, retarder, atol=1e-9)
-        np.testing.assert_allclose(found.depolarizer, depolarizer, atol=1e-12)
+        factors = lu_chipman(depolarizer @ retarder)
+        np.testing.assert_allclose(factors.retarder, retarder, atol=1e-9)
+        np.testing.assert_allclose(factors.depolarizer, depolarizer, atol=1e-12)
 
     def test_planar_single_precision_images(self) -> None:
         m = random_mueller(60 * 300, seed=9).reshape(60, 300, 4, 4)
@@ -169,15 +169,17 @@ class TestLuChipman:
 class TestSymmetric:
     def test_factors_are_what_they_say_and_give_m_back(self) -> None:
         m = random_mueller(800, seed=3)
-        found = symmetric(m)
-        assert found.defined.mean() > 0.99
-        m, found = m[found.defined], type(found)(*(f[found.defined] for f in found))
-        retarder_1 = np.swapaxes(found.retarder_1, 1, 2)
-        rebuilt = found.diattenuator_2 @ found.retarder_2 @ found.depolarizer @ retarder_1 @ found.diattenuator_1
+        factors = symmetric(m)
+        assert factors.defined.mean() > 0.99
+        m, factors = m[factors.defined], type(factors)(*(f[factors.defined] for f in factors))
+        retarder_1 = np.swapaxes(factors.retarder_1, 1, 2)
+        rebuilt = (
+            factors.diattenuator_2 @ factors.retarder_2 @ factors.depolarizer @ retarder_1 @ factors.diattenuator_1
+        )
         np.testing.assert_allclose(rebuilt, m, atol=1e-7 * m.max())
-        for retarder in (found.retarder_1, found.retarder_2):
+        for retarder in (factors.retarder_1, factors.retarder_2):
             np.testing.assert_allclose(np.linalg.det(retarder), 1, atol=1e-12)
-        d = np.diagonal(found.depolarizer, axis1=1, axis2=2)
+        d = np.diagonal(factors.depolarizer, axis1=1, axis2=2)
         assert (np.diff(np.abs(d), axis=1) <= 1e-9 * m.max()).all()
         np.testing.assert_array_equal(d[:, 3] < 0, np.linalg.det(m) < 0)
 
@@ -190,14 +192,14 @@ class TestSymmetric:
         retarder_2 = mueller.rotation(0.25) @ mueller.retarder(-0.4, 0.4)
         depolarizer = np.diag([2.0, 1.4, 1.0, 0.4])
         m = diattenuator_2 @ retarder_2 @ depolarizer @ retarder_1.T @ diattenuator_1
-        found = symmetric(m)
-        assert found.defined
-        np.testing.assert_allclose(found.diattenuator_1, diattenuator_1, atol=1e-12)
-        np.testing.assert_allclose(found.diattenuator_2, diattenuator_2, atol=1e-12)
-        np.testing.assert_allclose(found.depolarizer, depolarizer, atol=1e-12)
+        factors = symmetric(m)
+        assert factors.defined
+        np.testing.assert_allclose(factors.diattenuator_1, diattenuator_1, atol=1e-12)
+        np.testing.assert_allclose(factors.diattenuator_2, diattenuator_2, atol=1e-12)
+        np.testing.assert_allclose(factors.depolarizer, depolarizer, atol=1e-12)
         # Turning a common principal axis by pi in both retarders changes nothing, so compare what acts.
         np.testing.assert_allclose(
-            found.retarder_2 @ found.depolarizer @ found.retarder_1.T,
+            factors.retarder_2 @ factors.depolarizer @ factors.retarder_1.T,
             retarder_2 @ depolarizer @ retarder_1.T,
             atol=1e-12,
         )
@@ -209,28 +211,30 @@ class TestSymmetric:
         jordan = np.array([[2.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]])
         pure = mueller.retarder(0.3, 1.0) @ mueller.diattenuator(0.1, 1, 0.5)
         cases = np.stack([mueller.polarizer(0.3), np.full((4, 4), np.nan), np.zeros((4, 4)), unphysical, jordan, pure])
-        found = symmetric(cases)
-        assert not found.defined.any()
-        assert np.isnan(found.depolarizer).all()
+        factors = symmetric(cases)
+        assert not factors.defined.any()
+        assert np.isnan(factors.depolarizer).all()
 
 
 class TestDifferential:
     def test_agrees_with_the_plain_matrix_logarithm(self) -> None:
         m = random_mueller(200, seed=4)
-        found = differential(m)
-        assert 0.5 < found.defined.mean() < 1
-        for k in np.flatnonzero(found.defined):
+        generators = differential(m)
+        assert 0.5 < generators.defined.mean() < 1
+        for k in np.flatnonzero(generators.defined):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RuntimeWarning)  # scipy's own estimate, at 2e-13
                 logarithm = np.real(logm(m[k]))
-            np.testing.assert_allclose(found.mean[k] + found.fluctuation[k], logarithm, atol=1e-8)
-            np.testing.assert_allclose(expm(found.mean[k] + found.fluctuation[k]), m[k], atol=1e-8 * m[k].max())
-        values = np.linalg.eigvals(m[~found.defined])
+            np.testing.assert_allclose(generators.mean[k] + generators.fluctuation[k], logarithm, atol=1e-8)
+            np.testing.assert_allclose(
+                expm(generators.mean[k] + generators.fluctuation[k]), m[k], atol=1e-8 * m[k].max()
+            )
+        values = np.linalg.eigvals(m[~generators.defined])
         assert ((np.abs(values.imag) < 1e-9) & (values.real < 0)).any(axis=-1).all()
 
     def test_symmetry_of_the_parts(self) -> None:
-        found = differential(random_mueller(100, seed=5))
-        mean, fluctuation = found.mean[found.defined], found.fluctuation[found.defined]
+        generators = differential(random_mueller(100, seed=5))
+        mean, fluctuation = generators.mean[generators.defined], generators.fluctuation[generators.defined]
         diagonal = mean[:, :1, :1] * np.eye(4)
         np.testing.assert_allclose(mean - diagonal, -G @ np.swapaxes(mean - diagonal, 1, 2) @ G, atol=1e-12)
         np.testing.assert_allclose(fluctuation, G @ np.swapaxes(fluctuation, 1, 2) @ G, atol=1e-12)
@@ -245,33 +249,33 @@ class TestDifferential:
             l_matrix[i, j], l_matrix[j, i] = value, -value
         decay = np.array([0.3, 0.5, 0.7])
         m = expm(l_matrix - np.diag([0.0, *decay]) - 0.4 * np.eye(4))
-        found = differential(m)
-        assert found.defined
-        np.testing.assert_allclose(found.retardance(), retardance, atol=1e-10)
-        np.testing.assert_allclose(found.diattenuation(), diattenuation, atol=1e-10)
-        np.testing.assert_allclose(found.depolarization(), decay, atol=1e-10)
-        np.testing.assert_allclose(np.diag(found.mean), -0.4, atol=1e-10)
+        generators = differential(m)
+        assert generators.defined
+        np.testing.assert_allclose(generators.retardance(), retardance, atol=1e-10)
+        np.testing.assert_allclose(generators.diattenuation(), diattenuation, atol=1e-10)
+        np.testing.assert_allclose(generators.depolarization(), decay, atol=1e-10)
+        np.testing.assert_allclose(np.diag(generators.mean), -0.4, atol=1e-10)
 
     @pytest.mark.parametrize("azimuth", [0.0, 0.4, 1.3])
     def test_elements(self, azimuth: float) -> None:
-        found = differential(mueller.retarder(azimuth, 2.5) @ mueller.diattenuator(azimuth, 1.0, 0.3))
+        generators = differential(mueller.retarder(azimuth, 2.5) @ mueller.diattenuator(azimuth, 1.0, 0.3))
         axis = np.array([np.cos(2 * azimuth), np.sin(2 * azimuth), 0])
-        np.testing.assert_allclose(found.retardance(), 2.5 * axis, atol=1e-10)
-        np.testing.assert_allclose(found.diattenuation(), np.log(1 / 0.3) / 2 * axis, atol=1e-10)
-        np.testing.assert_allclose(found.fluctuation, 0, atol=1e-10)
+        np.testing.assert_allclose(generators.retardance(), 2.5 * axis, atol=1e-10)
+        np.testing.assert_allclose(generators.diattenuation(), np.log(1 / 0.3) / 2 * axis, atol=1e-10)
+        np.testing.assert_allclose(generators.fluctuation, 0, atol=1e-10)
 
     def test_defective_matrix(self) -> None:
         # Retardance and diattenuation of equal strength, crossed by 45 degrees: a null rotation, one eigenvector short.
         l_matrix = np.zeros((4, 4))
         l_matrix[0, 1] = l_matrix[1, 0] = 0.5
         l_matrix[1, 3], l_matrix[3, 1] = 0.5, -0.5
-        found = differential(expm(l_matrix))
-        assert found.defined
-        np.testing.assert_allclose(found.mean, l_matrix, atol=1e-7)
+        generators = differential(expm(l_matrix))
+        assert generators.defined
+        np.testing.assert_allclose(generators.mean, l_matrix, atol=1e-7)
 
     def test_where_it_is_not_defined(self) -> None:
         nothing = np.full((4, 4), np.nan)
         cases = [mueller.polarizer(0.3), mueller.IDEAL_MIRROR, mueller.retarder(0.2, np.pi), np.zeros((4, 4)), nothing]
-        found = differential(np.stack(cases))
-        assert not found.defined.any()
-        assert np.isnan(found.mean).all()
+        generators = differential(np.stack(cases))
+        assert not generators.defined.any()
+        assert np.isnan(generators.mean).all()

@@ -26,11 +26,11 @@ BOTH_127 = np.deg2rad(127.0), np.deg2rad(127.0)
 
 
 def test_the_labs_own_table() -> None:
-    found = score(MODEL.rows(rotating_retarders(0.1).angles_deg), NOISE)
-    assert found.rank == 16
-    assert found.condition_number == pytest.approx(7.14, abs=0.005)
-    assert found.equally_weighted_variance == pytest.approx(86.3, abs=0.05)
-    assert found.bound == 40
+    figures = score(MODEL.rows(rotating_retarders(0.1).angles_deg), NOISE)
+    assert figures.rank == 16
+    assert figures.condition_number == pytest.approx(7.14, abs=0.005)
+    assert figures.equally_weighted_variance == pytest.approx(86.3, abs=0.05)
+    assert figures.bound == 40
 
 
 def test_127_degrees_on_both_sides() -> None:
@@ -39,17 +39,17 @@ def test_127_degrees_on_both_sides() -> None:
 
 
 def test_ratio_five_with_forty_steps_has_rank_12() -> None:
-    found = score(MODEL.rows(rotating_retarders(0.1, ratio=5.0).angles_deg), NOISE)
-    assert found.rank == 12
-    assert found.equally_weighted_variance == np.inf
+    figures = score(MODEL.rows(rotating_retarders(0.1, ratio=5.0).angles_deg), NOISE)
+    assert figures.rank == 12
+    assert figures.equally_weighted_variance == np.inf
 
 
 def test_ideal_rows_are_those_of_the_instrument_model() -> None:
     generator, analyzer = two_retarders(MODEL)
     w = MODEL.rows(rotating_retarders(0.1).angles_deg).reshape(40, 16)
     zeros = tuple(np.deg2rad([-17.02, 13.41, -0.53]))
-    own = rows_of_design(40, 4.91, np.deg2rad(127.12), np.deg2rad(94.78), zeros_rad=zeros)
-    np.testing.assert_allclose(own, w, atol=1e-14)
+    rows = rows_of_design(40, 4.91, np.deg2rad(127.12), np.deg2rad(94.78), zeros_rad=zeros)
+    np.testing.assert_allclose(rows, w, atol=1e-14)
     assert (generator.axis, analyzer.axis) == ("psg", "psa")
 
 
@@ -57,19 +57,19 @@ def test_states_spread_evenly_over_both_spheres_reach_the_bound() -> None:
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
     s = 0.5 * np.concatenate([np.ones((4, 1)), corners], axis=1)
     w = np.einsum("ai,gj->agij", s, s).reshape(16, 16)
-    found = score(w, NOISE)
-    assert found.equally_weighted_variance == pytest.approx(found.bound) == pytest.approx(100)
+    figures = score(w, NOISE)
+    assert figures.equally_weighted_variance == pytest.approx(figures.bound) == pytest.approx(100)
 
 
 def test_predicted_errors_of_every_element() -> None:
     w = MODEL.rows(rotating_retarders(0.1).angles_deg).reshape(40, 16)
-    found = score(w, NOISE)
+    figures = score(w, NOISE)
     rng = np.random.default_rng(5)
     m00 = NOISE.electrons / w[:, 0].mean()
     signal = m00 * w[:, 0]
     frames = rng.poisson(signal, size=(20_000, 40)) + rng.normal(0, NOISE.read_noise_e, size=(20_000, 40))
     scatter = (frames @ np.linalg.pinv(w).T).std(axis=0) / m00
-    np.testing.assert_allclose(scatter.reshape(4, 4), found.element_stderr, rtol=5 / np.sqrt(2 * 20_000))
+    np.testing.assert_allclose(scatter.reshape(4, 4), figures.element_stderr, rtol=5 / np.sqrt(2 * 20_000))
 
 
 def test_optimizing_finds_better_retardances_and_ratios() -> None:
@@ -95,9 +95,9 @@ def test_more_states_are_better() -> None:
 def test_what_cannot_be_designed(configs: Path, tmp_path: Path) -> None:
     with pytest.raises(ProcessError, match="15 states cannot determine it"):
         optimize(MODEL, NOISE, [15], {}, ratio=4.91)
-    other = InstrumentModel.load(configs / "instruments/drr_imaging_630nm.yaml").at(630)
+    imaging = InstrumentModel.load(configs / "instruments/drr_imaging_630nm.yaml").at(630)
     with pytest.raises(ProcessError, match="turning elements: psa_retarder, analyzer"):
-        optimize(other, NOISE, [40], {}, ratio=4.91)
+        optimize(imaging, NOISE, [40], {}, ratio=4.91)
     with pytest.raises(ProcessError, match="positive signal"):
         AssumedNoise(0, 3)
     table = tmp_path / "states.csv"

@@ -37,23 +37,23 @@ def stokes():
 
 @pytest.mark.parametrize("states", [16, 24, 40])
 def test_free_angles_and_retardances_come_within_one_percent_of_the_bound(rgb950, states):
-    found = free_design(rgb950, states, free_retardances=True)
-    assert found.bound == pytest.approx(1600 / states)
-    assert 1 <= found.variance / found.bound < 1.01
-    assert list(found.retardances_deg.values()) == pytest.approx([131.8, 131.8], abs=1)
+    design = free_design(rgb950, states, free_retardances=True)
+    assert design.bound == pytest.approx(1600 / states)
+    assert 1 <= design.variance / design.bound < 1.01
+    assert list(design.retardances_deg.values()) == pytest.approx([131.8, 131.8], abs=1)
 
 
 def test_a_stokes_polarimeter_is_scored_by_what_it_determines(stokes):
     basis = determined_basis(stokes)
     assert basis.shape == (16, 4)
-    found = free_design(stokes, 8)
+    design = free_design(stokes, 8)
     # The generator sends (1, 0, 0, 0), and a plate of 131.8 degrees covers the sphere evenly: 40 / 8.
-    assert found.bound == pytest.approx(bound_of(stokes, 8)) == pytest.approx(5.0)
-    assert found.variance < 1.01 * found.bound
-    said = score(stokes.rows(found.angles_deg), AssumedNoise(20_000, 3), basis, found.bound)
-    assert (said.rank, said.full_rank) == (4, 4)
-    assert np.isfinite(said.element_stderr[:, 0]).all()
-    assert np.isnan(said.element_stderr[:, 1:]).all()
+    assert design.bound == pytest.approx(bound_of(stokes, 8)) == pytest.approx(5.0)
+    assert design.variance < 1.01 * design.bound
+    figures = score(stokes.rows(design.angles_deg), AssumedNoise(20_000, 3), basis, design.bound)
+    assert (figures.rank, figures.full_rank) == (4, 4)
+    assert np.isfinite(figures.element_stderr[:, 0]).all()
+    assert np.isnan(figures.element_stderr[:, 1:]).all()
     with pytest.raises(ProcessError, match="3 states give 3 intensities"):
         free_design(stokes, 3)
 
@@ -94,9 +94,9 @@ def test_order_keeps_every_pose(rgb950):
     assert periods_deg(rgb950) == {"psg": 180.0, "psa": 180.0}
     angles = np.random.default_rng(2).uniform(0, 360, (2, 30))
     speeds = [Speed(20, 40)] * 2
-    found = order_states(angles, np.array([180.0, 180.0]), speeds)
-    assert sorted(map(tuple, np.round(found.T % 180, 6))) == sorted(map(tuple, np.round(angles.T % 180, 6)))
-    assert move_seconds(found, speeds) < 0.6 * move_seconds(angles, speeds)
+    order = order_states(angles, np.array([180.0, 180.0]), speeds)
+    assert sorted(map(tuple, np.round(order.T % 180, 6))) == sorted(map(tuple, np.round(angles.T % 180, 6)))
+    assert move_seconds(order, speeds) < 0.6 * move_seconds(angles, speeds)
 
 
 def test_errors_of_the_bench_are_those_of_a_wrong_model(rgb950):
@@ -108,8 +108,8 @@ def test_errors_of_the_bench_are_those_of_a_wrong_model(rgb950):
     square = 0.0
     for axis in ("psg", "psa"):
         wrong = rgb950.rows({**angles, axis: angles[axis] + 0.1}).reshape(-1, 16)
-        found = m @ wrong.T @ np.linalg.pinv(w).T
-        square += np.mean((found[:, 1:] - m[:, 1:]) ** 2)
+        estimate = m @ wrong.T @ np.linalg.pinv(w).T
+        square += np.mean((estimate[:, 1:] - m[:, 1:]) ** 2)
     assert errors_of_table(rgb950, angles)["azimuth"] == pytest.approx(np.sqrt(square), rel=0.05)
 
 

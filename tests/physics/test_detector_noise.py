@@ -23,7 +23,7 @@ OPTICS = "instruments/rgb950.yaml"
 
 
 @pytest.fixture
-def taken(tmp_path, configs):
+def bench_file(tmp_path, configs):
     def capture(bench: TrueBench, air: bool, states: int = STATES):
         return bench_capture(tmp_path, configs / OPTICS, bench, air, states, seed=3)
 
@@ -68,8 +68,8 @@ def dark_margin(state: int, electrons):
         ("black_jitter", {"light": [dark_margin]}, "the black level is another one in every frame"),
     ],
 )
-def test_noise_is_told_and_does_not_alarm(taken, configs, name, bench, words, air):
-    data, tests, chi2 = read(taken(spoiled(name, 3, **bench), air), configs)
+def test_noise_is_told_and_does_not_alarm(bench_file, configs, name, bench, words, air):
+    data, tests, chi2 = read(bench_file(spoiled(name, 3, **bench), air), configs)
     assert len(data.told_of_noise) == (words is not None), data.told_of_noise
     assert words is None or words in data.told_of_noise[0], data.told_of_noise
     if name == "black_jitter":
@@ -80,10 +80,10 @@ def test_noise_is_told_and_does_not_alarm(taken, configs, name, bench, words, ai
     assert chi2 == pytest.approx(1.0, abs=0.03)
 
 
-def test_optics_are_judged_with_the_noise_that_is_found(taken, configs):
+def test_optics_are_judged_with_the_noise_that_is_found(bench_file, configs):
     """A gain that is misstated, beside a plate 2 degrees off: both are told, each as what it is."""
     bench = spoiled("gain_misstated", 3, rows=24, columns=24, dg=np.deg2rad(127.12 + 2.0))
-    judged, _ = diagnose_captures([taken(bench, air=True, states=18)], InstrumentModel.load(configs / OPTICS))
+    judged, _ = diagnose_captures([bench_file(bench, air=True, states=18)], InstrumentModel.load(configs / OPTICS))
     d = judged.diagnosis
     assert d.noise is not None
     assert d.noise.verdict == "not_as_declared"
@@ -93,14 +93,14 @@ def test_optics_are_judged_with_the_noise_that_is_found(taken, configs):
     assert d.error_after.chi2_reduced == pytest.approx(1.0, abs=0.03)
 
 
-def test_a_fault_of_the_optics_is_no_noise(taken, configs):
+def test_a_fault_of_the_optics_is_no_noise(bench_file, configs):
     """Not an image that wanders, a bent response, a source that flickers, or all of them."""
     bench = TrueBench(rows=40, columns=40, og=np.deg2rad(-16.0))
     bench.level.append(lambda k, a: 1 + 0.02 * np.sin(1.7 * k**2))
     bench.shift.append(lambda k, a: (0.4 * np.cos(a["psa"]), 0.4 * np.sin(a["psa"])))
     bench.transfer.append(lambda e: e - 3e-6 * e**2)
     bench.light.append(dark_margin)
-    data, _, _ = read(taken(bench, air=False), configs)
+    data, _, _ = read(bench_file(bench, air=False), configs)
     assert not data.told_of_noise
 
 
@@ -111,8 +111,8 @@ def test_a_bright_rim_of_few_pixels_is_no_offset_of_columns():
     inside[:16, :6], inside[18:, :6] = False, False
     light = np.where(inside, np.where(np.arange(side) < 6, 5.0, 0.5), np.nan) * np.ones((states, 1, 1))
     r = np.sqrt(light) * random.standard_normal(light.shape)
-    found = _compare(r, light, 0.01 * light, 1.0)
-    assert found.rows == found.columns == 0
-    found = _compare(r + 0.3 * random.standard_normal((states, 1, side)), light, 0.01 * light, 1.0)
-    assert found.columns == pytest.approx(0.09 / 0.5, rel=0.3)
-    assert found.rows == 0
+    excess = _compare(r, light, 0.01 * light, 1.0)
+    assert excess.rows == excess.columns == 0
+    excess = _compare(r + 0.3 * random.standard_normal((states, 1, side)), light, 0.01 * light, 1.0)
+    assert excess.columns == pytest.approx(0.09 / 0.5, rel=0.3)
+    assert excess.rows == 0

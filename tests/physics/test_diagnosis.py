@@ -61,9 +61,9 @@ def test_a_retardance_error_is_invisible_with_an_unknown_sample_and_plain_with_a
     assert air.verdict == "explained"
     (effect,) = air.effects
     assert (effect.kind, effect.element) == ("psg_retardance", "psg_retarder")
-    found = effect.parameters["retardance"]
-    assert found.value == pytest.approx(1.0, abs=3 * found.stderr)
-    assert found.stderr < 0.05
+    retardance = effect.parameters["retardance"]
+    assert retardance.value == pytest.approx(1.0, abs=3 * retardance.stderr)
+    assert retardance.stderr < 0.05
 
 
 @pytest.mark.parametrize(
@@ -85,8 +85,8 @@ def test_azimuths_of_analyzer_and_its_retarder_are_named_together(configs, tmp_p
     """With an unknown sample the two cannot be told apart, and air is what separates them."""
     d = diagnosed(capture(tmp_path, configs, TrueBench(oa=np.deg2rad(13.41 + 0.4)), air=False), configs)
     (effect,) = d.effects
-    both = {effect.kind, *(text.partition("[")[0] for text in effect.indistinguishable_from)}
-    assert both - {"unlisted"} == {"psa_azimuth", "analyzer_azimuth"}
+    kinds = {effect.kind, *(text.partition("[")[0] for text in effect.indistinguishable_from)}
+    assert kinds - {"unlisted"} == {"psa_azimuth", "analyzer_azimuth"}
     assert "air" in d.recommendation
 
 
@@ -101,10 +101,10 @@ def test_a_state_that_is_cut_off_at_zero_is_left_out(configs, tmp_path):
         counts = h5["entry/instrument/detector/data"][:, 0]
     empty = np.flatnonzero((counts == 0).mean(axis=(1, 2)) > 0.01)
     assert 0 < empty.size < 10
-    found = diagnosed(path, configs)
-    assert found.captures[0].cut_off == tuple(empty)
-    assert found.verdict == "explained"
-    offset, slip = found.effects
+    diagnosis = diagnosed(path, configs)
+    assert diagnosis.captures[0].cut_off == tuple(empty)
+    assert diagnosis.verdict == "explained"
+    offset, slip = diagnosis.effects
     assert (offset.kind, slip.kind, slip.element) == ("detector_offset", "rotation_slip", "psg@26")
     assert offset.parameters["offset"].value == pytest.approx(-1100, abs=3.5 * offset.parameters["offset"].stderr)
     assert slip.parameters["slip"].value == pytest.approx(0.4, abs=3.5 * slip.parameters["slip"].stderr)
@@ -113,9 +113,9 @@ def test_a_state_that_is_cut_off_at_zero_is_left_out(configs, tmp_path):
 @pytest.mark.long
 def test_nothing_wrong_is_consistent(configs, tmp_path):
     """What a pixel's residual shares with its own fit, through noise that differs from state to state, adds up."""
-    found = diagnosed(capture(tmp_path, configs, TrueBench(rows=400, columns=400), air=False, seed=4), configs)
-    assert found.verdict == "consistent"
-    assert max(found.captures[0].tests_before.values()) < 4
+    diagnosis = diagnosed(capture(tmp_path, configs, TrueBench(rows=400, columns=400), air=False, seed=4), configs)
+    assert diagnosis.verdict == "consistent"
+    assert max(diagnosis.captures[0].tests_before.values()) < 4
 
 
 @pytest.mark.long
@@ -136,16 +136,16 @@ def test_a_small_effect_beside_an_image_that_wanders_by_a_pixel(configs, tmp_pat
     bench = TrueBench(rows=32, columns=32, og=np.deg2rad(0.5))
     bench.shift.append(lambda k, a: (0.9 * np.cos(a["psg"]), 0.9 * np.sin(a["psg"])))
     path = capture(tmp_path, configs, bench, air=False)
-    found = diagnosed(path, configs)
-    assert found.verdict == "explained"
-    assert found.error_after.chi2_reduced == pytest.approx(1.0, abs=0.03)
-    by_kind = {e.kind: e for e in found.effects}
+    diagnosis = diagnosed(path, configs)
+    assert diagnosis.verdict == "explained"
+    assert diagnosis.error_after.chi2_reduced == pytest.approx(1.0, abs=0.03)
+    by_kind = {e.kind: e for e in diagnosis.effects}
     assert set(by_kind) == {"beam_wander", "psg_azimuth"}
     for name, true in (("x_cos", 0.9), ("x_sin", 0.0), ("y_cos", 0.0), ("y_sin", 0.9)):
         value = by_kind["beam_wander"].parameters[name]
         assert value.value == pytest.approx(true, abs=3.5 * value.stderr)
     # What is written is consistent the next time.
-    write_instrument(tmp_path / "new.yaml", InstrumentModel.load(configs / "instruments/rgb950.yaml"), found)
+    write_instrument(tmp_path / "new.yaml", InstrumentModel.load(configs / "instruments/rgb950.yaml"), diagnosis)
     again = diagnose_captures([path], InstrumentModel.load(tmp_path / "new.yaml"))[0].diagnosis
     assert again.verdict == "consistent"
 
@@ -174,14 +174,14 @@ def test_a_second_effect_beside_a_retardance_that_varies_over_the_image(configs,
     x = np.linspace(-1, 1, 40)
     bench.field_retardance = np.deg2rad(np.broadcast_to(1.5 * x, (40, 40)))
     bench.shift.append(lambda k, a: (0.8 * (k / (STATES - 1) - 0.5), 0.0))
-    found = diagnosed(capture(tmp_path, configs, bench, air=True), configs)
-    assert found.verdict == "explained"
-    by_kind = {e.kind: e for e in found.effects}
+    diagnosis = diagnosed(capture(tmp_path, configs, bench, air=True), configs)
+    assert diagnosis.verdict == "explained"
+    by_kind = {e.kind: e for e in diagnosis.effects}
     assert set(by_kind) == {"field_retardance", "image_drift"}
     for effect, x in (("field_retardance", 1.5), ("image_drift", 0.8)):
         for name, true in (("x", x), ("y", 0.0)):
-            told = by_kind[effect].parameters[name]
-            assert told.value == pytest.approx(true, abs=3.5 * told.stderr), name
+            estimate = by_kind[effect].parameters[name]
+            assert estimate.value == pytest.approx(true, abs=3.5 * estimate.stderr), name
 
 
 def test_shifts_on_a_mosaic_are_told_in_pixels_of_the_sensor(configs, tmp_path):
@@ -206,9 +206,9 @@ def test_shifts_on_a_mosaic_are_told_in_pixels_of_the_sensor(configs, tmp_path):
 def test_what_changes_in_a_part_of_the_image_is_no_source(configs, tmp_path):
     bench = TrueBench(rows=40, columns=40)
     bench.material_level.append((0, lambda k: 1 + 0.15 * (1 - np.exp(-3 * k / STATES))))
-    found = diagnosed(capture(tmp_path, configs, bench, air=True), configs)
-    assert not [e for e in found.effects if e.confident]
-    assert found.verdict == "unexplained"
+    diagnosis = diagnosed(capture(tmp_path, configs, bench, air=True), configs)
+    assert not [e for e in diagnosis.effects if e.confident]
+    assert diagnosis.verdict == "unexplained"
 
 
 @pytest.mark.long
@@ -222,18 +222,18 @@ def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, c
     assert ended.value.code == 0
     assert "psg_retardance" in capsys.readouterr().out
     keys = {"verdict", "error_before", "error_after", "noise_floor_percent", "effects", "unobservable"}
-    said = json.loads(out.read_text())
-    assert keys | {"recommendation"} <= set(said)
-    assert {"kind", "element", "parameters", "evidence", "indistinguishable_from"} <= set(said["effects"][0])
-    assert {"rms_percent", "chi2_reduced", "held_out"} <= set(said["error_after"])
+    document = json.loads(out.read_text())
+    assert keys | {"recommendation"} <= set(document)
+    assert {"kind", "element", "parameters", "evidence", "indistinguishable_from"} <= set(document["effects"][0])
+    assert {"rms_percent", "chi2_reduced", "held_out"} <= set(document["error_after"])
     page = report.read_text()
     assert page.count("data:image/png;base64,") == 2
     assert 'src="http' not in page
     assert "SIMULATED" in page
-    (left,) = read_residuals(tmp_path / "r.npz")
-    loud = {moment: np.nanmean(np.square(image.astype(float))) for moment, image in left.images.items()}
+    (residuals,) = read_residuals(tmp_path / "r.npz")
+    loud = {moment: np.nanmean(np.square(image.astype(float))) for moment, image in residuals.images.items()}
     assert loud["after"] < loud["before"]
-    assert left.images["after"].shape[0] == len(left.per_state["after"]) == STATES
+    assert residuals.images["after"].shape[0] == len(residuals.per_state["after"]) == STATES
     model = InstrumentModel.load(new)
     assert model.effects[0].kind == "psg_retardance"
     assert model.effects[0].captures == (path.stem,)
@@ -245,27 +245,27 @@ def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, c
     assert ended.value.code == 2
     assert "exists" in capsys.readouterr().err
     for name, target in (("--json", out), ("--report", report)):
-        kept = target.read_bytes()
+        content = target.read_bytes()
         with pytest.raises(SystemExit) as ended:
             cli.main([*call[:3], name, str(target)])
         assert ended.value.code == 2
         assert f"{target} exists and is not replaced" in capsys.readouterr().err
-        assert target.read_bytes() == kept
+        assert target.read_bytes() == content
 
 
 @pytest.mark.long
 def test_an_instrument_file_that_is_larger_than_what_is_read_is_not_written(configs, tmp_path, monkeypatch):
     path = capture(tmp_path, configs, TrueBench(rows=8, columns=8, dg=np.deg2rad(129.0)), air=True)
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml")
-    found = diagnosed(path, configs)
+    diagnosis = diagnosed(path, configs)
     monkeypatch.setattr(yaml_file, "MOST_BYTES", 1000)
     with pytest.raises(WriteError, match="diagnose fewer captures"):
-        write_instrument(tmp_path / "large.yaml", model, found)
+        write_instrument(tmp_path / "large.yaml", model, diagnosis)
     assert not (tmp_path / "large.yaml").exists()
 
 
 @pytest.mark.parametrize(
-    ("value", "stderr", "told"),
+    ("value", "stderr", "text"),
     [
         (0.0027915, 0.0022, "0.0028 ± 0.0022"),
         (-484.19, 0.65, "-484.19 ± 0.65"),
@@ -274,27 +274,27 @@ def test_an_instrument_file_that_is_larger_than_what_is_read_is_not_written(conf
         ((0.1, -0.2), (0.01, 0.01), "2 values, -0.2 to 0.1"),
     ],
 )
-def test_a_value_is_told_as_far_as_it_is_known(value, stderr, told):
-    assert EffectParameter(value=value, stderr=stderr, unit="1").text == told
+def test_a_value_is_told_as_far_as_it_is_known(value, stderr, text):
+    assert EffectParameter(value=value, stderr=stderr, unit="1").text == text
 
 
 def test_states_at_which_an_axis_may_have_slipped_are_told_in_one():
-    others = (
+    alternatives = (
         "rotation_slip[psa@17]",
         "analyzer_azimuth",
         "rotation_slip[psa@2]",
         "rotation_slip[psg@5]",
         "psa_azimuth[p]",
     )
-    told = FoundEffect(
+    names = FoundEffect(
         kind="rotation_ratio",
         element="psa",
         parameters={},
         evidence=7.0,
-        indistinguishable_from=others,
+        indistinguishable_from=alternatives,
         scope="instrument",
         removal_chance=0.0,
         confident=True,
     ).could_be
     states = "rotation_slip[psa] from one of the states 2 to 17"
-    assert told == (states, "analyzer_azimuth", "rotation_slip[psg@5]", "psa_azimuth[p]")
+    assert names == (states, "analyzer_azimuth", "rotation_slip[psg@5]", "psa_azimuth[p]")

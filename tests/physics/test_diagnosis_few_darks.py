@@ -47,11 +47,11 @@ def test_noise_of_few_darks_is_expected_in_the_residual(kind, unknowns, darks, s
         data = read_capture(capture, model)
     a = rows @ np.eye(4).reshape(16, 1) if kind == "air" else rows
     signal = data.signal.reshape(24, -1).astype(float)
-    left = signal - a @ np.linalg.lstsq(a, signal, rcond=None)[0]
+    residual = signal - a @ np.linalg.lstsq(a, signal, rcond=None)[0]
     outside = np.eye(24) - a @ np.linalg.pinv(a)
     variance = (data.slope * np.maximum(signal.mean(axis=1), 0) + data.floor) @ np.diag(outside)
     freedom = 3000 * (24 - unknowns)
-    assert (left**2).sum() / (3000 * variance) == pytest.approx(1, abs=3 * np.sqrt(2 / freedom))
+    assert (residual**2).sum() / (3000 * variance) == pytest.approx(1, abs=3 * np.sqrt(2 / freedom))
 
 
 SIXTEEN_BITS = 2.1, 4.0, 600.0, 16
@@ -85,11 +85,11 @@ def test_noise_of_darks_is_no_fault_where_states_are_dark(camera, darks, texture
         instrument_yaml=CROSSED,
         detector={"gain_e_per_count": gain, "read_noise_e": read, "bits": bits},
     )
-    found = diagnose_captures([path], model)[0].diagnosis
-    assert (found.verdict, found.effects) == ("consistent", ())
+    diagnosis = diagnose_captures([path], model)[0].diagnosis
+    assert (diagnosis.verdict, diagnosis.effects) == ("consistent", ())
     if camera == SIXTEEN_BITS:
         # Of 8 bits the rounding of the dark frames of single pixels is known less well than their noise.
-        assert found.noise.verdict == "as_declared"
+        assert diagnosis.noise.verdict == "as_declared"
 
 
 def test_a_bend_is_named_where_read_noise_is_a_quarter_of_a_count(synthetic_capture):
@@ -116,9 +116,9 @@ def test_a_bend_is_named_where_read_noise_is_a_quarter_of_a_count(synthetic_capt
         instrument_yaml=stated,
         detector={"gain_e_per_count": gain, "read_noise_e": 0.35, "bits": 12},
     )
-    found = diagnose_captures([path], InstrumentModel.load(file))[0].diagnosis
-    assert found.verdict == "explained"
-    values = {effect.kind: next(iter(effect.parameters.values())) for effect in found.effects}
+    diagnosis = diagnose_captures([path], InstrumentModel.load(file))[0].diagnosis
+    assert diagnosis.verdict == "explained"
+    values = {effect.kind: next(iter(effect.parameters.values())) for effect in diagnosis.effects}
     plate, curve = values["psa_retardance"], values["detector_nonlinearity"]
     assert (plate.value, plate.stderr) == (pytest.approx(-1, abs=0.05), pytest.approx(0.01, abs=0.005))
     assert (curve.value, curve.stderr) == (pytest.approx(bend, abs=0.002), pytest.approx(0.0005, abs=0.0003))

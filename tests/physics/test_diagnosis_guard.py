@@ -37,10 +37,10 @@ def test_of_tied_values_the_sum_that_the_data_tell_counts() -> None:
 
 def test_an_alternative_stands_in_for_what_is_applied() -> None:
     # A slip, or in one case of ten another that moves M in the same way: wrong about the name, right about M.
-    mean, both = np.array([0.9, 0.1]), 0.09 * np.array([[1.0, -1.0], [-1.0, 1.0]]) + 1e-4 * np.eye(2)
-    given = np.array([0.9, 0.0])
-    assert predicted_change(given, mean, both, np.ones((2, 2))).chance_worse < 1e-6
-    assert predicted_change(given, mean, both, np.eye(2)).chance_worse > 0.05
+    mean, covariance = np.array([0.9, 0.1]), 0.09 * np.array([[1.0, -1.0], [-1.0, 1.0]]) + 1e-4 * np.eye(2)
+    values = np.array([0.9, 0.0])
+    assert predicted_change(values, mean, covariance, np.ones((2, 2))).chance_worse < 1e-6
+    assert predicted_change(values, mean, covariance, np.eye(2)).chance_worse > 0.05
 
 
 def test_nothing_that_is_changed_makes_nothing_worse() -> None:
@@ -61,14 +61,16 @@ def test_of_captures_whose_sample_changed_the_others_bear_a_correction_out() -> 
     assert lasts(NOTHING, _solved([100.0, 50.0], [0.0, 0.0]), {0})
     assert not lasts(NOTHING, _solved([100.0, 50.0], [0.0, 55.0]), {0})
     assert not lasts(NOTHING, _solved([100.0, 50.0], [0.0, 0.0]), {0, 1})
-    told = [check.name for check in chances(NOTHING, NOTHING, lasting=False, each={})]
-    assert told[-1].endswith("so it is written for these captures alone")
+    names = [check.name for check in chances(NOTHING, NOTHING, lasting=False, each={})]
+    assert names[-1].endswith("so it is written for these captures alone")
 
 
 def test_what_a_correction_does_to_each_of_several_captures_is_told_and_does_not_decide() -> None:
     flat = predicted_change(np.array([1e-3]), np.array([1e-3]), np.array([[1e-6]]), np.eye(1))
-    *_, air, told = chances(NOTHING, NOTHING, lasting=True, each={"air (air.h5)": NOTHING, "flat (flat.h5)": flat})
+    *_, air, flat_check = chances(
+        NOTHING, NOTHING, lasting=True, each={"air (air.h5)": NOTHING, "flat (flat.h5)": flat}
+    )
     assert air.name == "predicted error of M/m00 of air (air.h5), rms (it grows with a chance of less than 0.0001)"
-    assert told.name == "predicted error of M/m00 of flat (flat.h5), rms (it grows with a chance of 0.31)"
-    assert (told.before, told.after) == (flat.before, flat.after)
-    assert told.holds
+    assert flat_check.name == "predicted error of M/m00 of flat (flat.h5), rms (it grows with a chance of 0.31)"
+    assert (flat_check.before, flat_check.after) == (flat.before, flat.after)
+    assert flat_check.holds

@@ -33,8 +33,8 @@ def test_light_that_leaks_scatters_and_an_offset_does_not(configs, tmp_path, lea
     problem = InstrumentProblem(model, [data], folds=1)
     offset, leak = (next(c for c in problem.pool() if c.kind == kind) for kind in ("detector_offset", "psa_extinction"))
     # Either describes the counts: what is left is noise. The scatter knows which it is.
-    there, value = (leak, np.array([0.1])) if leaks else (offset, np.array([80.0]))
-    gain = scatter_prefers(problem, Space((there,)), value, {offset: np.array([80.0])})
+    cause, value = (leak, np.array([0.1])) if leaks else (offset, np.array([80.0]))
+    gain = scatter_prefers(problem, Space((cause,)), value, {offset: np.array([80.0])})
     assert gain < -NEEDED if leaks else gain > NEEDED
 
 

@@ -55,14 +55,14 @@ def test_tests_of_pure_noise_scatter_by_one_standard_deviation():
     outside = np.eye(rows) - q @ q.T
     expected = np.broadcast_to(np.diag(outside)[:, None, None], (rows, side, side)).astype(np.float32)
     around = np.broadcast_to(random.uniform(0.5, 1.5, (side, side)), (rows, side, side)).astype(np.float32)
-    found = []
+    scores = []
     for _ in range(100):
-        left = np.tensordot(outside, random.normal(size=(rows, side, side)), 1).astype(np.float32)
-        images = Images(left, around, expected, np.ones((side, side), dtype=bool))
+        residual = np.tensordot(outside, random.normal(size=(rows, side, side)), 1).astype(np.float32)
+        images = Images(residual, around, expected, np.ones((side, side), dtype=bool))
         tests, _ = _tests(images, np.ones(rows), np.zeros((rows, 2)), 16, spread=1.0, noise_known=True)
-        found.append([value for name, value in tests.items() if name != "sum of squares"])
-    assert len(found[0]) == 5
-    assert np.std(found, axis=0) == pytest.approx(np.ones(5), abs=0.25)
+        scores.append([value for name, value in tests.items() if name != "sum of squares"])
+    assert len(scores[0]) == 5
+    assert np.std(scores, axis=0) == pytest.approx(np.ones(5), abs=0.25)
 
 
 def test_noise_of_light_is_told_where_the_sample_shows_few_of_its_elements(configs):
@@ -77,9 +77,9 @@ def test_noise_of_light_is_told_where_the_sample_shows_few_of_its_elements(confi
     light = np.tensordot(rows, m, 1)
     read = 0.03 * light.mean() / electrons
     noise = random.normal(0, np.sqrt(read), light.shape)
-    found = estimated_noise(steady_capture(random.poisson(electrons * light) / electrons + noise, 0.0))
-    assert found.slope[0] * electrons == pytest.approx(1, abs=0.02)
-    assert found.floor[0] == pytest.approx(read, rel=0.1)
+    estimate = estimated_noise(steady_capture(random.poisson(electrons * light) / electrons + noise, 0.0))
+    assert estimate.slope[0] * electrons == pytest.approx(1, abs=0.02)
+    assert estimate.floor[0] == pytest.approx(read, rel=0.1)
 
 
 def test_what_captures_leave_over_is_told_with_their_names():

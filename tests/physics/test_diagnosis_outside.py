@@ -64,13 +64,13 @@ def diagnosed_from(
     return diagnose_captures([path], InstrumentModel.load(file))[0].diagnosis
 
 
-def sure(found: Diagnosis) -> list[str]:
-    return [e.kind for e in found.effects if e.answer == "sure"]
+def sure(diagnosis: Diagnosis) -> list[str]:
+    return [e.kind for e in diagnosis.effects if e.answer == "sure"]
 
 
-def sentences(found: Diagnosis) -> list[str]:
+def sentences(diagnosis: Diagnosis) -> list[str]:
     """What is named, or could be, that has no name in the list."""
-    every = [f"{e.kind}[{e.element}]" for e in found.effects] + [n for e in found.effects for n in e.could_be]
+    every = [f"{e.kind}[{e.element}]" for e in diagnosis.effects] + [n for e in diagnosis.effects for n in e.could_be]
     return [name.partition("[")[2].rstrip("]") for name in every if name.startswith("unlisted")]
 
 
@@ -82,48 +82,48 @@ def test_an_image_that_moves_is_told_from_a_ghost_that_goes_round(configs, tmp_p
     assert sure(diagnosed(tmp_path, configs, bench)) == ["beam_wander"]
     bench.shift.clear()
     ghost(bench, np.random.default_rng(6), STATES)
-    found = diagnosed(tmp_path, configs, bench)
-    assert "beam_wander" in [e.kind for e in found.effects]
-    assert not sure(found)
+    diagnosis = diagnosed(tmp_path, configs, bench)
+    assert "beam_wander" in [e.kind for e in diagnosis.effects]
+    assert not sure(diagnosis)
 
 
 @pytest.mark.long
 def test_an_image_that_moves_twice_a_turn_is_corrected_without_a_name(configs, tmp_path, bench):
     turn = 4 * np.pi / STATES
     bench.shift.append(lambda k, a: (0.15 * np.cos(turn * k), 0.15 * np.sin(turn * k)))
-    found = diagnosed(tmp_path, configs, bench)
-    assert not sure(found)
-    assert [e.element for e in found.applied()] == ["shift right and shift down of image by 2 x psg"]
+    diagnosis = diagnosed(tmp_path, configs, bench)
+    assert not sure(diagnosis)
+    assert [e.element for e in diagnosis.applied()] == ["shift right and shift down of image by 2 x psg"]
 
 
 def test_a_focus_that_follows_a_plate_is_corrected_without_a_name(configs, tmp_path, bench):
     turn = 2 * np.pi / STATES
     bench.light.append(lambda k, e: gaussian_filter(e, np.sqrt(0.15 * (1 + np.cos(turn * k))), mode="nearest"))
-    found = diagnosed(tmp_path, configs, bench)
-    assert not sure(found)
-    assert "blur of image by 1 x psg" in [e.element for e in found.applied()]
+    diagnosis = diagnosed(tmp_path, configs, bench)
+    assert not sure(diagnosis)
+    assert "blur of image by 1 x psg" in [e.element for e in diagnosis.applied()]
 
 
 def test_a_cloud_before_the_lamp_is_no_fault_of_a_plate(configs, tmp_path, bench):
     bench.level.append(lambda k, a: 1 - 0.02 * np.exp(-(((k - 18) / 4) ** 2)))
-    found = diagnosed(tmp_path, configs, bench)
-    assert not sure(found)
-    assert "gain of source wandering" in sentences(found)
+    diagnosis = diagnosed(tmp_path, configs, bench)
+    assert not sure(diagnosis)
+    assert "gain of source wandering" in sentences(diagnosis)
 
 
 def test_light_that_moves_over_a_disc_is_no_image_that_moves(configs, tmp_path, bench):
     x = np.linspace(-1, 1, PIXELS)
     bench.light.append(lambda k, e: e * (1 + 0.03 * x * (k / (STATES - 1) - 0.5)))
-    found = diagnosed(tmp_path, configs, bench)
-    assert not sure(found)
-    assert [e.element for e in found.applied()] == ["brightness right and brightness down of image over time"]
+    diagnosis = diagnosed(tmp_path, configs, bench)
+    assert not sure(diagnosis)
+    assert [e.element for e in diagnosis.applied()] == ["brightness right and brightness down of image over time"]
 
 
 @pytest.mark.long
 def test_a_black_level_that_drifts_is_no_bent_response(configs, tmp_path, bench):
-    found = diagnosed(tmp_path, configs, bench, drift_counts=200)
-    assert not sure(found)
-    assert sentences(found) == ["offset of detector over time"]
+    diagnosis = diagnosed(tmp_path, configs, bench, drift_counts=200)
+    assert not sure(diagnosis)
+    assert sentences(diagnosis) == ["offset of detector over time"]
 
 
 def test_every_sentence_is_read_back_from_its_text(configs):
@@ -142,11 +142,11 @@ def test_a_sentence_is_the_less_likely_the_more_there_are_of_its_kind(configs):
     conditions = Conditions.of({axis: np.rad2deg(angle) for axis, angle in angles.items()})
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
     every = {s.text: s.price(conditions) for s in sentences_of(model, conditions)}
-    one = every["lag of detector"]
-    assert every["stray of detector by 4 x psg"] > every["stray of detector by 2 x psg"] == one
+    lag = every["lag of detector"]
+    assert every["stray of detector by 4 x psg"] > every["stray of detector by 2 x psg"] == lag
     for kind in ("gain of source from state", "gain of source beating"):
         group = [price for text, price in every.items() if text.startswith(kind)]
-        assert np.exp(one - np.array(group)).sum() == pytest.approx(1, abs=0.1)
+        assert np.exp(lag - np.array(group)).sum() == pytest.approx(1, abs=0.1)
 
 
 def test_light_that_is_reflected_inside_a_plate_passes_it_three_times(configs):
@@ -158,9 +158,9 @@ def test_light_that_is_reflected_inside_a_plate_passes_it_three_times(configs):
         e.model_copy(update={"retardance_deg": 3 * e.retardance_deg}) if e.name == "psa_retarder" else e
         for e in model.analyzer
     ]
-    other = model.model_copy(update={"analyzer": tuple(thrice)})
+    ghost = model.model_copy(update={"analyzer": tuple(thrice)})
     assert model.rows(angles, changes) == pytest.approx(
-        0.99 * model.rows(angles) + 0.01 * other.rows(angles), abs=1e-12
+        0.99 * model.rows(angles) + 0.01 * ghost.rows(angles), abs=1e-12
     )
 
 
@@ -168,13 +168,13 @@ def test_light_that_is_reflected_inside_a_plate_passes_it_three_times(configs):
 def test_a_plate_whose_retardance_changes_twice_a_turn_is_not_called_a_transmission(configs, tmp_path, bench):
     turn = 4.91 * 2 * np.pi / STATES
     bench.retardance.append(lambda k, a: (0.0, np.deg2rad(1.5) * np.cos(2 * turn * k - 0.4)))
-    found = diagnosed(tmp_path, configs, bench)
-    assert not sure(found)
-    assert "retardance of psa_retarder by 2 x psa" in sentences(found)
+    diagnosis = diagnosed(tmp_path, configs, bench)
+    assert not sure(diagnosis)
+    assert "retardance of psa_retarder by 2 x psa" in sentences(diagnosis)
     bench.retardance.clear()
     bench.level.append(lambda k, a: 1 + 0.01 * np.cos(turn * k - 0.4) + 0.005 * np.cos(2 * turn * k))
-    found = diagnosed(tmp_path, configs, bench)
-    assert sure(found) == ["retarder_transmission"]
+    diagnosis = diagnosed(tmp_path, configs, bench)
+    assert sure(diagnosis) == ["retarder_transmission"]
 
 
 @pytest.mark.long
@@ -189,17 +189,17 @@ def test_optics_that_differ_from_part_to_part_are_not_called_by_their_name(confi
 def test_a_sample_that_turns_is_not_angles_of_an_axis(configs, tmp_path, bench):
     """Its azimuth drifts with all plates and polarizers; single angles of the analyzer can stand for that."""
     bench.turned.append(lambda k: np.deg2rad(-0.8) * (k / (STATES - 1) - 0.5))
-    found = diagnosed(tmp_path, configs, bench)
-    assert not sure(found)
-    assert "azimuth of sample over time" in sentences(found)
+    diagnosis = diagnosed(tmp_path, configs, bench)
+    assert not sure(diagnosis)
+    assert "azimuth of sample over time" in sentences(diagnosis)
 
 
 @pytest.mark.long
 def test_frames_that_are_read_with_the_next_ones_are_not_angles_of_an_axis(configs, tmp_path, bench):
     image_lag(bench, np.random.default_rng(5), STATES)
-    found = diagnosed(tmp_path, configs, bench)
-    assert not sure(found)
-    assert "lag of detector" in sentences(found)
+    diagnosis = diagnosed(tmp_path, configs, bench)
+    assert not sure(diagnosis)
+    assert "lag of detector" in sentences(diagnosis)
 
 
 @pytest.mark.long
@@ -210,16 +210,16 @@ def test_a_lamp_that_drifts_while_the_machine_is_busy(configs, tmp_path):
     times = busy_machine(bench, random, STATES)
     bench.late_s = random.exponential(0.5, STATES)
     bench.level.append(lambda k, a: 1 + 0.1 * (times[k] - 0.5))
-    found = diagnosed(tmp_path, configs, bench)
-    assert [e.kind for e in found.effects] == [e.kind for e in found.applied()] == ["source_drift"]
+    diagnosis = diagnosed(tmp_path, configs, bench)
+    assert [e.kind for e in diagnosis.effects] == [e.kind for e in diagnosis.applied()] == ["source_drift"]
 
 
 @pytest.mark.long
 def test_a_lamp_that_jumps_is_no_source_that_drifts(configs, tmp_path, bench):
     lamp_jump(bench, np.random.default_rng(3), STATES)
-    found = diagnosed(tmp_path, configs, bench)
-    assert not sure(found)
-    assert any(sentence.startswith("gain of source from state") for sentence in sentences(found))
+    diagnosis = diagnosed(tmp_path, configs, bench)
+    assert not sure(diagnosis)
+    assert any(sentence.startswith("gain of source from state") for sentence in sentences(diagnosis))
     bench.level.clear()
     bench.level.append(lambda k, a: 1 + 0.01 * k / (STATES - 1))
     assert sure(diagnosed(tmp_path, configs, bench)) == ["source_drift"]
@@ -240,9 +240,9 @@ def test_a_name_beside_a_fault_without_one_is_likely(configs, tmp_path, bench):
     bench.shift.append(lambda k, a: (0.1 * np.cos(turn * k), 0.1 * np.sin(turn * k)))
     assert sure(diagnosed(tmp_path, configs, bench)) == ["beam_wander"]
     bench.retardance.append(lambda k, a: (0.0, np.deg2rad(1.5) * np.cos(2 * 4.91 * turn * k - 0.4)))
-    found = diagnosed(tmp_path, configs, bench)
-    assert {e.kind: e.answer for e in found.effects} == {"unlisted": "unlisted", "beam_wander": "likely"}
-    assert found.verdict == "explained"
+    diagnosis = diagnosed(tmp_path, configs, bench)
+    assert {e.kind: e.answer for e in diagnosis.effects} == {"unlisted": "unlisted", "beam_wander": "likely"}
+    assert diagnosis.verdict == "explained"
 
 
 @pytest.mark.long
@@ -251,9 +251,9 @@ def test_light_of_two_directions_in_a_plate_is_no_plate_that_is_turned(sample, c
     """An unknown sample takes up all of it but what an azimuth does as well; air shows its parts, which are many."""
     random, angles = np.random.default_rng(4), state_angles(STATES, False, False)
     scene = TrueScene(random, np.eye(4)) if sample == "air" else RoundSample(random)
-    other = replace(bench, og=bench.og + 0.6)
-    light = 0.97 * expose(bench, scene, angles) + 0.03 * expose(other, scene, angles)
-    found = diagnosed_from(tmp_path, configs, bench, light, random=random, sample=sample)
-    assert not sure(found)
-    assert any("psg_retarder" in sentence for sentence in sentences(found))
-    assert found.applied()
+    tilted = replace(bench, og=bench.og + 0.6)
+    light = 0.97 * expose(bench, scene, angles) + 0.03 * expose(tilted, scene, angles)
+    diagnosis = diagnosed_from(tmp_path, configs, bench, light, random=random, sample=sample)
+    assert not sure(diagnosis)
+    assert any("psg_retarder" in sentence for sentence in sentences(diagnosis))
+    assert diagnosis.applied()

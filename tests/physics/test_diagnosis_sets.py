@@ -41,25 +41,25 @@ def test_probabilities_are_those_of_all_sets(average):
     # Two that are nearly the same, one that is there, one of two values that is weak.
     design[:, 1] = design[:, 0] + 0.3 * random.standard_normal(40)
     sets = Sets(form(design, np.array([0.5, 0, 1.0, 0, 0.2])), groups(1, 1, 1, 2), QUIET)
-    scores, there = [], []
+    scores, presence = [], []
     for tau in product([0.0, *TAU], repeat=4):
         scores.append(sets.fitted(State(np.array(tau))).score)
-        there.append(np.array(tau) > 0)
+        presence.append(np.array(tau) > 0)
     weight = np.exp(np.array(scores) - max(scores))
-    exact = weight @ np.array(there) / weight.sum()
-    found = average(sets, likely_set(sets), 800)
-    assert found.probability == pytest.approx(exact, abs=0.08)
+    exact = weight @ np.array(presence) / weight.sum()
+    posterior = average(sets, likely_set(sets), 800)
+    assert posterior.probability == pytest.approx(exact, abs=0.08)
     # Which of the two alike is open, that one is there is not.
     assert 0.05 < exact[0] < 0.999
-    assert found.any_of([0, 1]) > 0.99
+    assert posterior.any_of([0, 1]) > 0.99
 
 
 def test_one_cause_that_does_what_two_do_has_its_share_from_either_side():
     """Between them lies a set of all three, or one that leaves half of the data: no chain passes that."""
     half = 60 * np.random.default_rng(5).standard_normal((90, 4))
     design = np.hstack([half, half])
-    made = [*groups(2, 2), Group(np.arange(4, 8), price=5.5)]
-    sets = Sets(form(design, np.array([0.5, -0.4, 0.3, 0.5, 0, 0, 0, 0]), 2), made, QUIET, count=400)
+    causes = [*groups(2, 2), Group(np.arange(4, 8), price=5.5)]
+    sets = Sets(form(design, np.array([0.5, -0.4, 0.3, 0.5, 0, 0, 0, 0]), 2), causes, QUIET, count=400)
     taus = np.array(list(product([0.0, *TAU], repeat=3)))
     scores = np.array([sets.fitted(State(tau)).score for tau in taus])
     weight = np.exp(scores - scores.max())
@@ -73,8 +73,8 @@ def test_a_rare_cause_of_nearly_all_structure_is_found_behind_common_ones_that_e
     """What it leaves has a smaller unit, in which it is plain; in the unit of all structure nothing is."""
     curvature = np.diag([1.0] * 30 + [1500.0])
     gradient = np.append(np.zeros(30), -np.sqrt(14_500 * 1500.0))
-    made = [*groups(*(1 for _ in range(30))), Group(np.array([30]), price=9.0)]
-    sets = Sets(Quadratic(18_000.0, gradient, curvature), made, Noise(True, directions=24.0, slack=400.0))
+    causes = [*groups(*(1 for _ in range(30))), Group(np.array([30]), price=9.0)]
+    sets = Sets(Quadratic(18_000.0, gradient, curvature), causes, Noise(True, directions=24.0, slack=400.0))
     state = State(np.append(np.zeros(30), TAU[-1]))
     assert sets.fitted(sets.settled(state)).score > sets.fitted(sets.empty()).score + 2
     assert np.flatnonzero(likely_set(sets).tau).tolist() == [30]
@@ -85,7 +85,7 @@ def test_what_is_unlikely_one_by_one_is_likely_together():
     size, curvature = 30, 50.0
     gradient = np.sqrt(curvature) * np.random.default_rng(19).normal(0, 1.5, size)
     sets = Sets(Quadratic(0.0, gradient, curvature * np.eye(size)), groups(*[1] * size), QUIET)
-    found = stay(sets, sets.empty(), 1000)
+    posterior = stay(sets, sets.empty(), 1000)
     # Independent data: sums over all sets of one size are elementary symmetric polynomials of the Bayes factors.
     width = 1 / (curvature + TAU**-2.0)
     factor = np.sqrt(width) / TAU * np.exp(0.5 * gradient[:, None] ** 2 * width)
@@ -101,8 +101,8 @@ def test_what_is_unlikely_one_by_one_is_likely_together():
     mean = -gradient[:, None] * width
     square = exact * np.sum(weight * (width + mean**2), axis=1)
     variance = square - (exact * np.sum(weight * mean, axis=1)) ** 2
-    assert found.probability == pytest.approx(exact, abs=0.05)
-    assert np.diag(found.covariance).sum() == pytest.approx(variance.sum(), rel=0.15)
+    assert posterior.probability == pytest.approx(exact, abs=0.05)
+    assert np.diag(posterior.covariance).sum() == pytest.approx(variance.sum(), rel=0.15)
 
 
 def symmetric(factors):
@@ -120,9 +120,9 @@ def test_two_small_causes_are_found_beside_values_that_imitate_them():
     slip, ratio = (states > 14) * 1.0, states / 39 - 0.5
     design = 60 * np.column_stack([np.eye(40), slip, ratio])
     truth = np.concatenate([np.zeros(40), [0.5, -0.6]])
-    both = Sets(form(design, truth, 29), [*groups(40), Group(np.array([40]), 38.0), Group(np.array([41]))], QUIET)
-    assert likely_set(both).tau[1:].all()
-    assert not likely_set(both).tau[0]
+    sets = Sets(form(design, truth, 29), [*groups(40), Group(np.array([40]), 38.0), Group(np.array([41]))], QUIET)
+    assert likely_set(sets).tau[1:].all()
+    assert not likely_set(sets).tau[0]
 
 
 def test_the_mean_is_nearer_to_the_truth_than_the_data_are():
@@ -131,9 +131,9 @@ def test_the_mean_is_nearer_to_the_truth_than_the_data_are():
     truth = 0.05 * random.standard_normal(40)
     design = np.vstack([np.eye(40) * 10.0])
     sets = Sets(form(design, truth), groups(40), QUIET)
-    found = sample(sets, likely_set(sets), 50)
+    posterior = sample(sets, likely_set(sets), 50)
     alone = -np.linalg.solve(sets.form.curvature, sets.form.gradient)
-    assert np.linalg.norm(found.mean - truth) < 0.7 * np.linalg.norm(alone - truth)
+    assert np.linalg.norm(posterior.mean - truth) < 0.7 * np.linalg.norm(alone - truth)
 
 
 def test_nothing_is_there_where_nothing_is():
@@ -172,9 +172,9 @@ def test_two_that_say_the_same_share_the_mean(average):
     design = 100 * random.standard_normal((90, 60))
     design[:, 1] = design[:, 0]
     sets = Sets(form(design, np.eye(60)[0] + np.eye(60)[5] - np.eye(60)[7]), groups(*[1] * 60), QUIET)
-    found = average(sets, likely_set(sets), 1500)
-    assert found.probability[:2] == pytest.approx(0.5, abs=0.15)
-    assert found.mean[:2] == pytest.approx(0.5, abs=0.15)
+    posterior = average(sets, likely_set(sets), 1500)
+    assert posterior.probability[:2] == pytest.approx(0.5, abs=0.15)
+    assert posterior.mean[:2] == pytest.approx(0.5, abs=0.15)
 
 
 def test_a_descent_stays_where_the_model_has_numbers():
@@ -183,9 +183,13 @@ def test_a_descent_stays_where_the_model_has_numbers():
 
     def sums(space, x, derivatives=True):
         excess = 25.0 if x[0] == 0 else np.nan
-        one = np.ones((1, 1))
+        unit = np.ones((1, 1))
         return SimpleNamespace(
-            excess=np.array([excess]), freedom=np.array([10.0]), gradient=-5 * one, curvature=one[None], stretch=0 * one
+            excess=np.array([excess]),
+            freedom=np.array([10.0]),
+            gradient=-5 * unit,
+            curvature=unit[None],
+            stretch=0 * unit,
         )
 
     problem = SimpleNamespace(folds=1, relinearize=lambda space, x: False, sums=sums)
@@ -210,17 +214,17 @@ def test_of_those_that_may_be_there_alone_never_two_are():
 def test_the_state_that_a_slip_begins_at_is_one_of_those_that_the_data_leave_open():
     """That the axis slipped is certain, and one frame that hardly saw it tells from which state on."""
     states = np.arange(40)
-    seen = np.where(states == 14, 0.02, 1.0)
-    design = 100 * np.column_stack([seen * (states >= first) for first in (13, 14, 15)])
+    sensitivity = np.where(states == 14, 0.02, 1.0)
+    design = 100 * np.column_stack([sensitivity * (states >= first) for first in (13, 14, 15)])
     space = Space(tuple(slipped(first) for first in (13, 14, 15)))
     sets = Sets(form(design, np.array([0.0, 0.5, 0.0]), 30), groups(1, 1, 1), QUIET)
     state = likely_set(sets)
     samples = SimpleNamespace(best=state, any_of=lambda members: 1.0)
-    found = Posterior(space, ((0,), (1,), (2,)), sets, samples, np.zeros(3), np.eye(3), {})
-    (cause,) = causes(found, 0.0)
-    told = {c.place for c in (*cause.candidates, *cause.alternatives)}
+    posterior = Posterior(space, ((0,), (1,), (2,)), sets, samples, np.zeros(3), np.eye(3), {})
+    (cause,) = causes(posterior, 0.0)
+    places = {c.place for c in (*cause.candidates, *cause.alternatives)}
     assert cause.answer == "one of"
-    assert told == {"psg@14", "psg@15"}
+    assert places == {"psg@14", "psg@15"}
     assert cause.other_effects == ()
 
 

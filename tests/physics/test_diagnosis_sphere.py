@@ -64,8 +64,8 @@ def test_what_is_wrong_gets_its_name(scene, declared, tmp_path, kind):
     also = {"channel_azimuth"} if kind == "analyzer_roll" else set()
     assert set(effect.indistinguishable_from) <= ({"not_triply_degenerate", *also} if declared.mosaic else set())
     for name, truth in fault.parameters[kind].items():
-        found = effect.parameters[name]
-        assert found.value == pytest.approx(truth, abs=3.5 * found.stderr)
+        estimate = effect.parameters[name]
+        assert estimate.value == pytest.approx(truth, abs=3.5 * estimate.stderr)
     assert d.error_after.rms_percent < 1.05 * d.noise_floor_percent
     # A small fault is well under the noise of a pixel and plain over all of them.
     assert d.error_after.rms_percent < d.error_before.rms_percent
@@ -113,13 +113,15 @@ def test_what_is_not_in_the_list_gets_no_name(scene, configs, tmp_path, kind):
 @pytest.mark.long
 def test_two_effects_at_once(scene, configs, tmp_path):
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
-    both = scene_faults.ArmZeroFault(scene, 2.0)
-    fault = SphereFault("two", both, scene_faults.turned_generator(declared, 1.0), scene.material)
+    arm = scene_faults.ArmZeroFault(scene, 2.0)
+    fault = SphereFault("two", arm, scene_faults.turned_generator(declared, 1.0), scene.material)
     d, _ = diagnosed(tmp_path, fault, declared, scene)
-    found = {e.kind: next(iter(e.parameters.values())) for e in d.effects}
-    assert set(found) == {"arm_zero", "illumination_azimuth"}
-    assert found["arm_zero"].value == pytest.approx(2.0, abs=3.5 * found["arm_zero"].stderr)
-    assert found["illumination_azimuth"].value == pytest.approx(1.0, abs=3.5 * found["illumination_azimuth"].stderr)
+    estimates = {e.kind: next(iter(e.parameters.values())) for e in d.effects}
+    assert set(estimates) == {"arm_zero", "illumination_azimuth"}
+    assert estimates["arm_zero"].value == pytest.approx(2.0, abs=3.5 * estimates["arm_zero"].stderr)
+    assert estimates["illumination_azimuth"].value == pytest.approx(
+        1.0, abs=3.5 * estimates["illumination_azimuth"].stderr
+    )
 
 
 @pytest.mark.parametrize(("omega_deg", "light"), [(102.0, 1.0), (60.0, 0.1)])
@@ -133,11 +135,11 @@ def test_an_index_where_little_is_polarized_has_an_honest_error(scene, configs, 
         data = read_surface(capture, declared.at(NM), scene.object.geometry, fault.material)
     problem = SurfaceProblem(declared.at(NM), [data])
     space = Space(tuple(c for c in problem.pool() if c.kind == "refractive_index"))
-    found = fit_posterior(problem, space, (), np.zeros(2), say=lambda line: None)
-    solved = solution(problem, found, Space(()), np.zeros(0))
-    error = np.sqrt(np.diag(widen_errors(problem, found, solved)[1]))
+    posterior = fit_posterior(problem, space, (), np.zeros(2), say=lambda line: None)
+    solved = solution(problem, posterior, Space(()), np.zeros(0))
+    error = np.sqrt(np.diag(widen_errors(problem, posterior, solved)[1]))
     truth = np.array([fault.parameters["refractive_index"][n] for n in ("n", "k")])
-    assert np.all(np.abs(found.values - truth) < 3.5 * error)
+    assert np.all(np.abs(posterior.values - truth) < 3.5 * error)
     assert error[0] < 0.05
 
 

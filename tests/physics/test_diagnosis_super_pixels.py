@@ -37,8 +37,8 @@ def diagnosed(synthetic_capture, configs):
         frames = np.empty((len(ANGLES["psa"]), 1, RAW, RAW))
         for k, channel in enumerate(model.channels):
             (r, c), *_ = np.argwhere(np.array(model.mosaic) == channel.name)
-            here = (slice(None), slice(r, None, 2), slice(c, None, 2))
-            frames[:, 0, *here[1:]] = np.einsum("ns,syx->nyx", analyzers[:, k], light[here])
+            pixels = (slice(None), slice(r, None, 2), slice(c, None, 2))
+            frames[:, 0, *pixels[1:]] = np.einsum("ns,syx->nyx", analyzers[:, k], light[pixels])
         electrons = random.poisson(ELECTRONS * frames) + random.normal(0, READ, frames.shape)
         detector = {"gain_e_per_count": GAIN, "read_noise_e": READ, "black_level_counts": BLACK, "bits": 16}
         path = synthetic_capture(
@@ -55,10 +55,10 @@ def test_places_apart_are_no_fault(diagnosed, rim):
 
 
 def test_a_fault_beside_them_is_found(diagnosed):
-    found = diagnosed(1.01)
-    assert found.verdict == "explained"
-    (gain,) = found.effects
+    diagnosis = diagnosed(1.01)
+    assert diagnosis.verdict == "explained"
+    (gain,) = diagnosis.effects
     assert gain.kind == "channel_gain"
-    told = gain.parameters["channel_45"]
-    assert told.value == pytest.approx(0.01, abs=4 * told.stderr)
-    assert told.stderr < 3e-4
+    estimate = gain.parameters["channel_45"]
+    assert estimate.value == pytest.approx(0.01, abs=4 * estimate.stderr)
+    assert estimate.stderr < 3e-4

@@ -20,10 +20,10 @@ def test_directions_hold_what_another_capture_will_have_too():
     covariance, lasts = np.diag([*np.full(40, 1.0), 0.01]), np.arange(size) == 40
     covariance[40, 0] = covariance[0, 40] = 0.05
     stored = _leading(covariance, np.eye(size), lasts)[1][:, :MOST_STORED]
-    told = stored @ stored.T
-    assert told[40, 40] == pytest.approx(0.01, rel=0.05)
+    product = stored @ stored.T
+    assert product[40, 40] == pytest.approx(0.01, rel=0.05)
     # What they share with it belongs to it.
-    assert told[40, 0] == pytest.approx(0.05, rel=0.1)
+    assert product[40, 0] == pytest.approx(0.05, rel=0.1)
 
 
 def test_without_anything_that_lasts_the_largest_come_first():
@@ -39,10 +39,10 @@ def test_what_varies_over_the_image_is_asked_for_beside_all_groups():
     form = Quadratic(float(data @ data - 60), -design.T @ data, design.T @ design)
     sets = Sets(form, [Group(np.arange(60)), *(Group(np.array([k])) for k in (60, 61, 62))], Noise(True, 20.0, 22.0))
     state = likely_set(sets)
-    found = Some(samples=Some(best=state), sets=sets)
+    posterior = Some(samples=Some(best=state), sets=sets)
     assert state.unit > 1000
-    assert WholeBench._least_unit(Some(whole=Some(noise_known=True)), found) < 10
-    assert WholeBench._least_unit(Some(whole=Some(noise_known=False)), found) == state.unit
+    assert WholeBench._least_unit(Some(whole=Some(noise_known=True)), posterior) < 10
+    assert WholeBench._least_unit(Some(whole=Some(noise_known=False)), posterior) == state.unit
 
 
 def test_what_is_found_and_not_used_is_uncertain_as_a_whole():
@@ -51,10 +51,10 @@ def test_what_is_found_and_not_used_is_uncertain_as_a_whole():
         Candidate(type("E", (), {"kind": k})(), "", (Parameter("p", "1", -9.0, 9.0, 1.0),)) for k in ("drift", "path")
     )
     space = Space((drift, path))
-    own = (np.array([0, 1]), np.eye(2))
-    errors = MuellerErrors(space, np.array([1.0, 4.0]), np.diag([0.01, 0.09]), np.zeros((16, 2, 2)), (own,))
+    direction = (np.array([0, 1]), np.eye(2))
+    errors = MuellerErrors(space, np.array([1.0, 4.0]), np.diag([0.01, 0.09]), np.zeros((16, 2, 2)), (direction,))
     used = Some(space=Space((drift,)), fit=Some(values=np.array([1.0])))
     assert errors.corrected_values(used).tolist() == [1.0, 0.0]
-    change = errors._change(*own[:1], errors.corrected_values(used), own[1])
+    change = errors._change(*direction[:1], errors.corrected_values(used), direction[1])
     assert change.before == pytest.approx(np.sqrt(17.1))
     assert change.after == pytest.approx(np.sqrt(16.1))

@@ -74,15 +74,15 @@ def _tile_by_tile(problem, space, values):
     da = slopes_of_rows(changes_of, model, data.conditions, space, values=values, a=a, columns=columns)
     dc = problem.slopes_of_counts(0, space, values, c)
     tiles, use = moments.tiles, moments.counts
-    known, z, noise = features_of_tiles(data, moments, tiles, range(len(FEATURES)))
-    around = np.array(known) >= len(FEATURES) - DERIVATIVES
+    features, z, noise = features_of_tiles(data, moments, tiles, range(len(FEATURES)))
+    around = np.array(features) >= len(FEATURES) - DERIVATIVES
     excess, (gradient, stretch) = np.zeros(2), np.zeros((2, 2, space.size))
     curvature = np.zeros((2, space.size, space.size))
     for t, fold in enumerate(tiles.fold):
-        one = slice(t, t + 1)
-        part = Projected(z[one], noise[one], a[one][:, use], c[None][:, :, use], around=around)
+        tile = slice(t, t + 1)
+        part = Projected(z[tile], noise[tile], a[tile][:, use], c[None][:, :, use], around=around)
         excess[fold] += np.sum(part.residual**2) - part.expected.sum()
-        told = part.slopes(da[:, one][:, :, use], dc[:, None][..., use])
-        for total, of_one in zip((gradient, stretch, curvature), told, strict=True):
+        slopes = part.slopes(da[:, tile][:, :, use], dc[:, None][..., use])
+        for total, of_one in zip((gradient, stretch, curvature), slopes, strict=True):
             total[fold] += of_one
     return excess, gradient, stretch, curvature

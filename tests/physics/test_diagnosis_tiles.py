@@ -17,7 +17,7 @@ from simulators.blind.undeclared_captures import TrueBench
 
 
 @pytest.fixture(scope="module")
-def seen(configs, tmp_path_factory):
+def scene(configs, tmp_path_factory):
     file = configs / "instruments/rgb950.yaml"
     path = bench_capture(tmp_path_factory.mktemp("tiles"), file, TrueBench(rows=32, columns=32), seed=3)
     model, data = read(path, file)
@@ -25,24 +25,24 @@ def seen(configs, tmp_path_factory):
 
 
 @pytest.mark.parametrize("elements", [("psg_retarder",), ("psg_retarder", "psa_retarder")])
-def test_columns_of_every_tile_are_those_of_its_own_retardance(seen, elements):
-    model, data, moments = seen
+def test_columns_of_every_tile_are_those_of_its_own_retardance(scene, elements):
+    model, data, moments = scene
     random = np.random.default_rng(8)
     changes = Changes(data.conditions)
     changes.stray = 0.01
     changes.retardance_rad["psg_retarder"] = random.normal(0, 0.1, data.conditions.states)
     for element in elements:
         changes.field_retardance_rad[element] = random.normal(0, 0.3, 5)
-    found = tile_columns(model, data, moments, changes)
+    columns = tile_columns(model, data, moments, changes)
     smooth = field_terms(moments.tiles.x, moments.tiles.y)
     for tile in (0, 37, 63):
-        here = Changes(data.conditions, stray=0.01)
-        here.retardance_rad = defaultdict(lambda: np.zeros(()), changes.retardance_rad)
+        tile_changes = Changes(data.conditions, stray=0.01)
+        tile_changes.retardance_rad = defaultdict(lambda: np.zeros(()), changes.retardance_rad)
         for element in elements:
             extra = changes.field_retardance_rad[element] @ smooth[:, tile]
-            here.retardance_rad[element] = here.retardance_rad[element] + extra
-        rows = model.rows(data.conditions.angles_deg, here).reshape(-1, 16)
-        assert found[tile] == pytest.approx(rows / moments.sigma[:, None], abs=1e-12 / moments.sigma.min())
+            tile_changes.retardance_rad[element] = tile_changes.retardance_rad[element] + extra
+        rows = model.rows(data.conditions.angles_deg, tile_changes).reshape(-1, 16)
+        assert columns[tile] == pytest.approx(rows / moments.sigma[:, None], abs=1e-12 / moments.sigma.min())
 
 
 def test_a_tile_is_where_its_light_is():
@@ -69,15 +69,15 @@ def test_many_pixels_of_a_tile_are_as_few_as_their_products_need():
     assert z[:, 0] @ z[:, 0].transpose(0, 2, 1) == pytest.approx(tiles.s, rel=1e-6)
     u = data.signal[:, 0, :5, :5].reshape(2, -1)[:, tiles.pick[:5, :5].reshape(-1)].astype(float)
     assert np.sum(z[0, 1, 1] * z[0, 0, 0]) == pytest.approx(1e6 * np.sum(u[1] ** 2 * u[0]), rel=1e-6)
-    known, counts, _ = features_of_tiles(data, moments, tiles, [0])
-    assert known == (0,)
+    features, counts, _ = features_of_tiles(data, moments, tiles, [0])
+    assert features == (0,)
     counts = counts * sigma
     assert counts @ counts.transpose(0, 1, 3, 2) == pytest.approx(tiles.s[:, None], rel=1e-6)
 
 
 @pytest.mark.parametrize("shifted", [False, True])
-def test_tiles_that_are_all_alike_say_what_the_blocks_say(seen, shifted):
-    model, data, _ = seen
+def test_tiles_that_are_all_alike_say_what_the_blocks_say(scene, shifted):
+    model, data, _ = scene
     random = np.random.default_rng(9)
     if shifted:
         data = data.moved_back(random.uniform(-0.5, 0.5, (data.conditions.states, 2)))

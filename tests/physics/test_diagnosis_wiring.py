@@ -11,16 +11,16 @@ from processing.instrument.model import InstrumentModel
 from simulators.blind.undeclared_captures import TrueBench
 
 
-def problem(folder, configs, bench, told, air):
+def problem(folder, configs, bench, report_angles, air):
     """A capture whose file tells the angles `told`; the bench knows the true ones."""
     file = configs / "instruments/rgb950.yaml"
-    model, data = read(bench_capture(folder, file, bench, air, seed=4, told=told), file)
+    model, data = read(bench_capture(folder, file, bench, air, seed=4, report_angles=report_angles), file)
     return InstrumentProblem(model, [data])
 
 
 @pytest.mark.parametrize("air", [True, False])
 @pytest.mark.parametrize(
-    ("told", "word"),
+    ("report_angles", "word"),
     [
         (lambda a: a | {"psa": -a["psa"]}, "'psa' turns the other way"),
         (lambda a: {"psg": a["psa"], "psa": a["psg"]}, "each other's place"),
@@ -31,12 +31,12 @@ def problem(folder, configs, bench, told, air):
         (lambda a: {k: np.roll(v, 1) for k, v in a.items()}, "one early"),
     ],
 )
-def test_a_mistake_is_told(configs, tmp_path, told, word, air):
+def test_a_mistake_is_told(configs, tmp_path, report_angles, word, air):
     # Beside small faults of the optics, which are no mistake.
     bench = TrueBench(dg=np.deg2rad(128.0), lp=np.deg2rad(-0.2))
-    found = find_miswiring(problem(tmp_path, configs, bench, told, air))
-    assert found is not None
-    assert word in found.message
+    mistake = find_miswiring(problem(tmp_path, configs, bench, report_angles, air))
+    assert mistake is not None
+    assert word in mistake.message
 
 
 @pytest.mark.parametrize("air", [True, False])
@@ -60,28 +60,28 @@ def test_the_filter_of_another_wavelength_is_told(configs, tmp_path, air):
     # The plates of this bench have the retardances of 451 nm; the file says 662.
     bench = TrueBench(dg=np.deg2rad(130.01), da=np.deg2rad(143.13))
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
-    found = find_miswiring(problem(tmp_path, configs, bench, lambda a: a, air), declared)
+    mistake = find_miswiring(problem(tmp_path, configs, bench, lambda a: a, air), declared)
     if not air:
         # Retardances are what an unknown sample absorbs: nothing is told, and nothing wrong.
-        assert found is None or "451" in found.message
+        assert mistake is None or "451" in mistake.message
         return
-    assert found is not None
-    assert "the light is of 451 nm, not of 662" in found.message
-    assert "wavelength_nm: 451" in found.message
+    assert mistake is not None
+    assert "the light is of 451 nm, not of 662" in mistake.message
+    assert "wavelength_nm: 451" in mistake.message
 
 
 @pytest.mark.long
 def test_a_mistake_is_told_where_the_train_has_nominal_values(configs, tmp_path):
     """Azimuths and retardances that `calibrate` leaves open do not mend an axis that turns the other way."""
     bench = TrueBench(rows=9, columns=9, og=np.deg2rad(-3.0), dg=np.deg2rad(120.0), oa=np.deg2rad(30.0))
-    whole = problem(tmp_path, configs, bench, lambda a: a | {"psa": -a["psa"]}, air=True)
+    mirrored = problem(tmp_path, configs, bench, lambda a: a | {"psa": -a["psa"]}, air=True)
     nominal = ("psg_retarder.azimuth_deg", "psg_retarder.retardance_deg", "psa_retarder.azimuth_deg")
-    whole.models = tuple(m.model_copy(update={"calibrate": nominal}) for m in whole.models)
-    whole.model = whole.models[0]
-    assert WholeBench(whole, lambda line: None).train_is_off
-    found = find_train_miswiring(whole)
-    assert found is not None
-    assert "'psa' turns the other way" in found.message
+    mirrored.models = tuple(m.model_copy(update={"calibrate": nominal}) for m in mirrored.models)
+    mirrored.model = mirrored.models[0]
+    assert WholeBench(mirrored, lambda line: None).train_is_off
+    mistake = find_train_miswiring(mirrored)
+    assert mistake is not None
+    assert "'psa' turns the other way" in mistake.message
     straight = problem(tmp_path / "straight", configs, bench, lambda a: a, air=True)
-    straight.models, straight.model = whole.models, whole.model
+    straight.models, straight.model = mirrored.models, mirrored.model
     assert not WholeBench(straight, lambda line: None).train_is_off

@@ -64,11 +64,11 @@ def problem() -> InstrumentProblem:
 
 
 def test_a_smooth_curve_needs_fewer_coefficients_than_wavelengths() -> None:
-    found = curve(WAVELENGTHS, ONE)
-    assert found.basis.shape[1] < len(WAVELENGTHS)
+    smooth = curve(WAVELENGTHS, ONE)
+    assert smooth.basis.shape[1] < len(WAVELENGTHS)
     values = np.array([[retardance_deg(w) - 180] for w in WAVELENGTHS])
-    coefficients = found.through(values)
-    assert np.allclose([found.at(w) @ coefficients for w in WAVELENGTHS], values, atol=0.1)
+    coefficients = smooth.through(values)
+    assert np.allclose([smooth.at(w) @ coefficients for w in WAVELENGTHS], values, atol=0.1)
 
 
 def test_few_wavelengths_have_a_value_each() -> None:
@@ -85,15 +85,15 @@ def test_neighbours_are_alike_and_what_is_far_is_not() -> None:
 
 def test_a_train_far_off_is_followed_through_a_half_wave(problem) -> None:
     base = Space(problem.nominal())
-    found = first_values(problem, base, problem.pool(), lambda line: None)
-    values = np.concatenate([found[c] for c in base.candidates])
+    start = first_values(problem, base, problem.pool(), lambda line: None)
+    values = np.concatenate([start[c] for c in base.candidates])
     sums = problem.sums(base, values, derivatives=False)
     assert sums.excess.sum() < 5 * np.sqrt(2 * sums.freedom.sum())
     plate = next(c for c in base.candidates if c.place == "psg_retarder.retardance_deg")
-    told = [180 + v[0] for _, v, _ in plate.by_wavelength(found[plate], np.eye(plate.size))]
+    retardances = [180 + v[0] for _, v, _ in plate.by_wavelength(start[plate], np.eye(plate.size))]
     truth = np.array([retardance_deg(w) for w in WAVELENGTHS])
     # The same plate in the other sense, at all wavelengths: it never turns back.
-    assert min(np.abs(told - truth).max(), np.abs(360 - np.array(told) - truth).max()) < 0.2
+    assert min(np.abs(retardances - truth).max(), np.abs(360 - np.array(retardances) - truth).max()) < 0.2
 
 
 def test_gradient_by_coefficients(problem) -> None:

@@ -30,13 +30,13 @@ class Bench:
         at = np.concatenate([int(c.place) + np.arange(c.size) for c in space.candidates])
         x = np.zeros(self.truth.size)
         x[at] = values
-        rest = self.slopes @ (x - self.truth) + self.bends @ (x**2 - self.truth**2)
+        residual = self.slopes @ (x - self.truth) + self.bends @ (x**2 - self.truth**2)
         slopes = (self.slopes + 2 * self.bends * x)[:, at]
         out = Sums.empty(1, values.size if derivatives else 0)
-        out.excess[0], out.freedom[0] = PIXELS * rest @ rest + self.unlisted, FREEDOM
+        out.excess[0], out.freedom[0] = PIXELS * residual @ residual + self.unlisted, FREEDOM
         out.square[0] = out.count[0] = FREEDOM
         if derivatives:
-            out.gradient[0], out.curvature[0] = PIXELS * slopes.T @ rest, PIXELS * slopes.T @ slopes
+            out.gradient[0], out.curvature[0] = PIXELS * slopes.T @ residual, PIXELS * slopes.T @ slopes
         return out
 
     def powers(self) -> list[tuple[int, np.ndarray]]:

@@ -84,11 +84,11 @@ def hidden(monkeypatch):
     """Makes one module invisible to the search of the folders."""
 
     def hide(folder: str, name: str) -> None:
-        found = pkgutil.iter_modules
+        iter_modules = pkgutil.iter_modules
         path = importlib.import_module(folder).__path__
 
         def without(where=None, prefix=""):
-            return (i for i in found(where, prefix) if not (i.name == name and list(where or ()) == list(path)))
+            return (i for i in iter_modules(where, prefix) if not (i.name == name and list(where or ()) == list(path)))
 
         monkeypatch.setattr(pkgutil, "iter_modules", without)
         instrument_effects.cache_clear()
@@ -146,9 +146,9 @@ def test_files_go_and_come_in_a_copy(tmp_path, configs):
     # All but one of each folder are deleted, and one that is new comes.
     for path in ROOT.rglob("*"):
         folder = ".".join(("processing", *path.relative_to(ROOT).parent.parts))
-        gone = (folder, path.stem) in FILES and path.stem not in ("psg_azimuth", "arm_zero")
+        is_hidden = (folder, path.stem) in FILES and path.stem not in ("psg_azimuth", "arm_zero")
         target = tmp_path / "processing" / path.relative_to(ROOT)
-        if path.is_file() and not gone and path.suffix != ".pyc":
+        if path.is_file() and not is_hidden and path.suffix != ".pyc":
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(path.read_bytes())
     (tmp_path / "processing/instrument/effects/dimmer.py").write_text(DIMMER)
@@ -185,10 +185,10 @@ def test_a_plug_in_is_found_for_both_kinds(monkeypatch):
         def bend(self, changes, place, values):
             pass
 
-    asked = []
-    monkeypatch.setattr("processing.effect.entry_points", lambda group: asked.append(group) or [EntryPoint(Gremlin)])
-    found = load_effects(FOLDERS[1], ReflectanceEffect, "umov.reflectance_effects")
-    assert (found["gremlin"].kind, asked) == ("gremlin", ["umov.reflectance_effects"])
+    groups = []
+    monkeypatch.setattr("processing.effect.entry_points", lambda group: groups.append(group) or [EntryPoint(Gremlin)])
+    effects = load_effects(FOLDERS[1], ReflectanceEffect, "umov.reflectance_effects")
+    assert (effects["gremlin"].kind, groups) == ("gremlin", ["umov.reflectance_effects"])
 
 
 @pytest.mark.parametrize("text", ["", DIMMER + DIMMER.replace("Dimmer", "Second")])

@@ -16,11 +16,11 @@ PIXELS = 2500
 PURE = five_samples()["non-depolarizing"]
 
 
-def assert_covered(found: dict[str, np.ndarray], truth: float) -> None:
+def assert_covered(block: dict[str, np.ndarray], truth: float) -> None:
     # Sampling makes 0.028 and 0.013 at three deviations. Quantiles at widths that are near, not equal, make the
     # intervals of 68 % a little long.
     for name, least, most in (("xi0_68", 0.655, 0.725), ("xi0_95", 0.93, 0.97)):
-        low, high = found[name].reshape(2, -1)
+        low, high = block[name].reshape(2, -1)
         assert least < np.mean((low <= truth) & (truth <= high)) < most, name
 
 
@@ -31,16 +31,16 @@ def blocks(matrix: np.ndarray, electrons: float, seed: int = 5) -> dict[str, np.
 @pytest.mark.parametrize("electrons", [20, 200, 20_000])
 @pytest.mark.parametrize("truth", [0.25, 0.255, 0.3, 0.4, 0.5, 0.7, 1.0])
 def test_intervals_of_a_triply_degenerate_matrix_cover(truth, electrons):
-    found = blocks(triply_degenerate.mueller_matrix(PURE, truth), electrons)
-    assert_covered(found, truth)
+    block = blocks(triply_degenerate.mueller_matrix(PURE, truth), electrons)
+    assert_covered(block, truth)
     # Nothing is left out because of what came out.
-    assert found["valid"].all()
-    quoted = np.median(found["xi0_errors"])
-    assert abs(np.mean(found["xi0"]) - truth) < 0.5 * quoted
+    assert block["valid"].all()
+    quoted = np.median(block["xi0_errors"])
+    assert abs(np.mean(block["xi0"]) - truth) < 0.5 * quoted
     if truth >= 0.4:
-        assert np.median(found["xi0"]) == pytest.approx(truth, abs=0.15 * quoted)
+        assert np.median(block["xi0"]) == pytest.approx(truth, abs=0.15 * quoted)
     # One number for either side, where the interval is lopsided too: half of it had pulls of rms 2 near 1/4.
-    pull = np.abs(found["xi0"] - truth) / found["xi0_errors"]
+    pull = np.abs(block["xi0"] - truth) / block["xi0_errors"]
     # Where xi0 leaves the noise of 1/4 the interval is longest against the scatter: 0.7.
     assert 0.68 < np.sqrt(np.mean(pull**2)) < 1.08
     assert np.mean(pull < 1) > 0.683 - 0.03
@@ -55,9 +55,9 @@ def test_intervals_cover_where_one_direction_is_much_noisier(states, truth):
     matrices = triply_degenerate.mueller_matrix(random_processes(PIXELS, 3), truth)
     # At 2000 the last ones do not determine m00.
     for electrons in (20_000,) if states == "24 others" else (2000, 20_000):
-        found = eigenvalue_block(noisy_image(matrices, electrons, 5, w))
-        assert found["valid"].all()
-        assert_covered(found, truth)
+        block = eigenvalue_block(noisy_image(matrices, electrons, 5, w))
+        assert block["valid"].all()
+        assert_covered(block, truth)
 
 
 def test_states_that_do_not_determine_the_brightness_give_no_xi0():
@@ -69,10 +69,10 @@ def test_states_that_do_not_determine_the_brightness_give_no_xi0():
 def test_exposures_may_differ():
     w = state_tables()["RGB950's 40"] * np.geomspace(0.1, 1, 40)[:, None]
     for truth, electrons in ((0.25, 20), (0.3, 2000)):
-        found = eigenvalue_block(
+        block = eigenvalue_block(
             noisy_image(triply_degenerate.mueller_matrix(random_processes(PIXELS, 1), truth), electrons, 5, w)
         )
-        assert_covered(found, truth)
+        assert_covered(block, truth)
 
 
 def test_heights_in_even_noise_are_those_of_other_draws():
@@ -84,10 +84,10 @@ def test_heights_in_even_noise_are_those_of_other_draws():
         noise[:, 0, 0] += theta
         values = np.linalg.eigvalsh(noise)
         noise[:, 0, 0] -= theta
-        seen = np.quantile(values[:, 3] - values[:, :3].mean(axis=1), LEVELS)
-        found = true_heights(np.eye(16), seen, np.full(len(LEVELS), np.sqrt(0.75)))
+        quantiles = np.quantile(values[:, 3] - values[:, :3].mean(axis=1), LEVELS)
+        heights = true_heights(np.eye(16), quantiles, np.full(len(LEVELS), np.sqrt(0.75)))
         # The draws of the two scatter by 0.06 in the outermost quantiles at 3.
-        np.testing.assert_allclose(np.diagonal(found), theta, atol=0.2)
+        np.testing.assert_allclose(np.diagonal(heights), theta, atol=0.2)
 
 
 @pytest.mark.parametrize("electrons", [20, 200, 20_000])
@@ -131,9 +131,9 @@ def test_far_above_the_noise_the_table_goes_on_smoothly():
     none = np.zeros(400)
     noise = EigenvalueNoise(even * np.sqrt(0.75), none, none, even, none, even)
     xi0 = np.linspace(0.25, 0.25 + 0.75 * 0.01 * (THETA[-1] + 4), 400)
-    rest = (1 - xi0) / 3
-    found = corrected(np.stack([xi0, rest, rest, rest], axis=-1), noise, np.eye(16))
-    for values in (found.xi0, *found.interval_68, *found.interval_95):
+    triplet = (1 - xi0) / 3
+    estimate = corrected(np.stack([xi0, triplet, triplet, triplet], axis=-1), noise, np.eye(16))
+    for values in (estimate.xi0, *estimate.interval_68, *estimate.interval_95):
         steps = np.diff(values)
         assert np.all(steps > 0)
         assert steps[-100:].max() < 1.5 * steps[-100:].min()
@@ -142,6 +142,6 @@ def test_far_above_the_noise_the_table_goes_on_smoothly():
 def test_without_errors_nothing_is_taken_off():
     image = noisy_image(np.tile(PURE, (4, 1, 1)), 200, 1, rgb950())
     unknown = np.full_like(image.errors, np.nan)
-    found = eigenvalue_block(type(image)(**(vars(image) | {"errors": unknown})))
-    np.testing.assert_allclose(found["xi0"], found["eigenvalues"][0])
-    assert not found["valid"].any()
+    block = eigenvalue_block(type(image)(**(vars(image) | {"errors": unknown})))
+    np.testing.assert_allclose(block["xi0"], block["eigenvalues"][0])
+    assert not block["valid"].any()

@@ -27,23 +27,23 @@ LEAST_68, LEAST_95 = 0.64 - 3 * np.sqrt(0.68 * 0.32 / PIXELS), 0.93 - 3 * np.sqr
 
 @pytest.mark.parametrize(("electrons", "darks"), [(200, 0), (2000, 1), (20_000, 4)])
 def test_every_interval_covers_for_every_sample(electrons: float, darks: int) -> None:
-    found = list(cells("RGB950's 40", darks, electrons, PIXELS, extra=EXTRA))
-    low = [c for c in found if c.in_95 < LEAST_95 or c.in_68 < LEAST_68]
+    table = list(cells("RGB950's 40", darks, electrons, PIXELS, extra=EXTRA))
+    low = [c for c in table if c.in_95 < LEAST_95 or c.in_68 < LEAST_68]
     # 800 cells: two in a thousand are beyond three standard deviations by chance.
     assert len(low) <= 4, low
-    assert all(c.in_95 > 0.85 for c in found), min(found, key=lambda c: c.in_95)
-    assert {c.has_interval for c in found} == {1.0}
+    assert all(c.in_95 > 0.85 for c in table), min(table, key=lambda c: c.in_95)
+    assert {c.has_interval for c in table} == {1.0}
     # Errors to first order covered 80 and 84 %.
     for name in ("coherency_eigenvalues", "eigenvalue_deviation"):
-        assert 0.64 <= np.median([c.in_68 for c in found if c.quantity == name]) <= 0.72
+        assert 0.64 <= np.median([c.in_68 for c in table if c.quantity == name]) <= 0.72
 
 
 @pytest.mark.parametrize("name", ["diattenuation", "polarizance_purity", "depolarization_index", "mueller"])
 def test_where_nothing_is_polarized_intervals_hold_as_often_as_they_claim(name: str) -> None:
-    found = cells(
+    table = cells(
         "RGB950's 40", 0, 200, 1500, samples=["ideal depolarizer", "nearly ideal depolarizer", "air"], extra=()
     )
-    for cell in found:
+    for cell in table:
         if cell.quantity == name:
             # The noise of the 15 elements is not quite alike in all directions, which the interval does not know.
             assert 0.63 < cell.in_68 < 0.76, cell
@@ -64,8 +64,8 @@ def test_depolarization_power_of_a_depolarizer_has_no_bias() -> None:
 @pytest.mark.parametrize("extinction", [100, 1000, 10_000])
 def test_a_polarizer_has_no_retardance_with_a_narrow_interval(extinction: int) -> None:
     matrix = nineteen_samples()[f"polarizer 1:{extinction}"]
-    found = quantities_block(noisy_image(np.tile(matrix, (PIXELS, 1, 1)), 200, 2), (), {})
-    low, high = found["retardance_deg_95"]
+    maps = quantities_block(noisy_image(np.tile(matrix, (PIXELS, 1, 1)), 200, 2), (), {})
+    low, high = maps["retardance_deg_95"]
     # 7 to 17 % of the pixels said 176 +- 7 degrees.
     assert np.mean(low > 1) < 0.05
     assert np.nanmedian(high - low) > 90
@@ -75,8 +75,8 @@ def test_a_mean_of_darks_is_one_error_of_m00() -> None:
     matrix = nineteen_samples()["triply degenerate"]
     truth = quantities_block(noisy_image(matrix[None], 1e13, 0), (), {})["depolarization_index"]
     image = noisy_image(np.tile(matrix, (1500, 1, 1)), 1000, 3, darks=1, read_noise_e=30)
-    found = quantities_block(image, (), {})
-    pull = (found["depolarization_index"] - truth) / found["depolarization_index_errors"]
+    maps = quantities_block(image, (), {})
+    pull = (maps["depolarization_index"] - truth) / maps["depolarization_index_errors"]
     # It was 1.67.
     assert np.sqrt(np.mean(pull**2)) == pytest.approx(1, abs=0.06)
 
@@ -86,18 +86,20 @@ def test_a_mean_of_darks_is_one_error_of_m00() -> None:
 def test_an_interval_of_a_length_covers_at_every_length(components: int, length: float) -> None:
     noise = np.random.default_rng(components).normal(size=(4000, components))
     noise[:, 0] += length
-    seen = np.linalg.norm(noise, axis=1)
-    found = interval(seen, np.ones_like(seen), np.full_like(seen, components), np.full_like(seen, components))
-    assert np.mean((found.low <= length) & (length <= found.high)) == pytest.approx(0.95, abs=0.017)
-    assert np.mean(np.abs(found.value - length) <= found.error) == pytest.approx(0.69, abs=0.05)
+    lengths = np.linalg.norm(noise, axis=1)
+    intervals = interval(
+        lengths, np.ones_like(lengths), np.full_like(lengths, components), np.full_like(lengths, components)
+    )
+    assert np.mean((intervals.low <= length) & (length <= intervals.high)) == pytest.approx(0.95, abs=0.017)
+    assert np.mean(np.abs(intervals.value - length) <= intervals.error) == pytest.approx(0.69, abs=0.05)
 
 
 def test_a_long_vector_with_little_noise_along_it_has_its_own_error() -> None:
     """That of a polarizer's diattenuation was more than half of the noise across it, and covered 100 %."""
     noise = np.random.default_rng(1).normal(size=(2, 20_000)) * [[0.1], [1.0]]
-    seen, one = np.hypot(50 + noise[0], noise[1]), np.ones(20_000)
-    found = interval(seen, 0.01 * one, 1.01 * one, 1.0001 * one)
-    assert np.mean(np.abs(found.value - 50) <= found.error) == pytest.approx(0.683, abs=0.02)
+    lengths, unit = np.hypot(50 + noise[0], noise[1]), np.ones(20_000)
+    intervals = interval(lengths, 0.01 * unit, 1.01 * unit, 1.0001 * unit)
+    assert np.mean(np.abs(intervals.value - 50) <= intervals.error) == pytest.approx(0.683, abs=0.02)
 
 
 @pytest.mark.parametrize(("components", "off_68", "off_95"), [(8.0, 0.04, 0.025), (3.0, 0.05, 0.03), (1.5, 0.05, 0.03)])
@@ -107,11 +109,11 @@ def test_intervals_of_eigenvalues_cover_at_every_gap(
 ) -> None:
     """Noise pushes equal ones apart: with errors to first order 68 % intervals of the sphere's covered 80 %."""
     random = np.random.default_rng(3)
-    seen, own = (part.T for part in eigenvalues(*gaps, random, blocks(components, random, 10_000)))
-    found = of_gaps(seen[0] - seen[1], seen[1] - seen[2], own, components)
+    values, noise = (part.T for part in eigenvalues(*gaps, random, blocks(components, random, 10_000)))
+    intervals = of_gaps(values[0] - values[1], values[1] - values[2], noise, components)
     mean = random.normal(0, np.sqrt(OF_MEAN), 10_000)
-    off = seen + found.middle + mean - deviations(*gaps)[:, None]
-    in_68, in_95 = np.abs(off) <= found.half, (off <= found.below) & (off >= -found.above)
+    off = values + intervals.middle + mean - deviations(*gaps)[:, None]
+    in_68, in_95 = np.abs(off) <= intervals.half, (off <= intervals.below) & (off >= -intervals.above)
     assert in_68.mean(axis=1) == pytest.approx(np.full(3, 0.68), abs=off_68)
     assert in_95.mean(axis=1) == pytest.approx(np.full(3, 0.95), abs=off_95)
 
@@ -123,10 +125,10 @@ def test_intervals_of_singular_values_cover_at_every_gap(
 ) -> None:
     """Those of equal ones covered 97 to 100 %, with a bias of their own error."""
     random = np.random.default_rng(3)
-    seen, own = (part.T for part in singular_values(np.array(true), random, blocks(components, random, 10_000, 9)))
-    found = of_singular_values(seen, own, np.ones(10_000), components)
-    off = seen + found.middle - np.array(true)[:, None]
-    in_68, in_95 = np.abs(off) <= found.half, (off <= found.below) & (off >= -found.above)
+    values, noise = (part.T for part in singular_values(np.array(true), random, blocks(components, random, 10_000, 9)))
+    intervals = of_singular_values(values, noise, np.ones(10_000), components)
+    off = values + intervals.middle - np.array(true)[:, None]
+    in_68, in_95 = np.abs(off) <= intervals.half, (off <= intervals.below) & (off >= -intervals.above)
     assert in_68.mean(axis=1) == pytest.approx(np.full(3, 0.68), abs=off_68)
     assert in_95.mean(axis=1) == pytest.approx(np.full(3, 0.95), abs=off_95)
 
@@ -145,17 +147,17 @@ def test_sorted_numbers_have_intervals_and_pulls_within_the_limits(quantity: str
 @pytest.mark.parametrize(("electrons", "sample"), [(2000, "det < 0"), (200, "polarizer 1:10")])
 def test_noise_across_a_short_vector_is_no_error_of_its_length(electrons: float, sample: str) -> None:
     """The error was 0.55 of the noise across at least: 68 % intervals covered 98 %, and pulls were 0.33."""
-    found = cells("127 degrees, 9 to 1, 41", 1, electrons, 1000, samples=[sample], extra=())
-    cell = next(c for c in found if c.quantity == "depolarization_index")
+    table = cells("127 degrees, 9 to 1, 41", 1, electrons, 1000, samples=[sample], extra=())
+    cell = next(c for c in table if c.quantity == "depolarization_index")
     assert 0.6 < cell.in_68 < 0.9
     assert cell.rms > 0.6
 
 
 def test_over_an_intensity_below_zero_a_length_has_no_interval() -> None:
     # Noise in the dark makes S0 or m00 negative. Whatever the other pixels show, such a pixel shows nothing.
-    observed, one = np.array([-40.0, -3.0, -1e-3, 0.0, 2.0]), np.ones(5)
-    lengths = interval(observed, one, 2 * one, 2 * one)
-    for bound in (*lengths, *sum_of_singular_values(observed, one)):
+    observed, unit = np.array([-40.0, -3.0, -1e-3, 0.0, 2.0]), np.ones(5)
+    lengths = interval(observed, unit, 2 * unit, 2 * unit)
+    for bound in (*lengths, *sum_of_singular_values(observed, unit)):
         assert np.isnan(bound[:3]).all()
         assert np.isfinite(bound[3:]).all()
 
@@ -172,34 +174,34 @@ def block(matrix: np.ndarray, electrons: float) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize(("axis", "electrons"), [(0.4, 200), (0.4, 20_000), (0.0, 20_000), (np.pi / 2, 200)])
 def test_near_180_degrees_the_axis_is_not_determined_but_the_pair_of_axes_is(axis: float, electrons: float) -> None:
-    found = block(triply_degenerate.mueller_matrix(mueller.retarder(axis, np.pi), 0.9), electrons)
-    assert np.std(found["retardance_fast_axis_deg"]) > 20  # it flips
-    low, high = found["retardance_fast_axis_deg_95"]
+    maps = block(triply_degenerate.mueller_matrix(mueller.retarder(axis, np.pi), 0.9), electrons)
+    assert np.std(maps["retardance_fast_axis_deg"]) > 20  # it flips
+    low, high = maps["retardance_fast_axis_deg_95"]
     assert np.mean(high - low > 170) > 0.9
-    assert found["retardance_axis_flip"].mean() > 0.1
+    assert maps["retardance_axis_flip"].mean() > 0.1
     # Of the two axes: 0 and 90 degrees are the same.
-    apart = (found["retardance_axis_or_90_deg"] - np.rad2deg(axis) + 45) % 90 - 45
-    pull = apart / found["retardance_axis_or_90_deg_errors"]
+    apart = (maps["retardance_axis_or_90_deg"] - np.rad2deg(axis) + 45) % 90 - 45
+    pull = apart / maps["retardance_axis_or_90_deg_errors"]
     assert np.sqrt(np.mean(pull**2)) == pytest.approx(1, abs=0.15)
 
 
 def test_farther_from_180_degrees_the_axis_is_determined() -> None:
-    found = block(triply_degenerate.mueller_matrix(mueller.retarder(0.4, np.deg2rad(170)), 0.9), 20_000)
-    pull = (found["retardance_fast_axis_deg"] - np.rad2deg(0.4)) / found["retardance_fast_axis_deg_errors"]
+    maps = block(triply_degenerate.mueller_matrix(mueller.retarder(0.4, np.deg2rad(170)), 0.9), 20_000)
+    pull = (maps["retardance_fast_axis_deg"] - np.rad2deg(0.4)) / maps["retardance_fast_axis_deg_errors"]
     assert np.sqrt(np.mean(pull**2)) == pytest.approx(1, abs=0.15)
-    assert found["retardance_axis_flip"].max() < 1e-3
+    assert maps["retardance_axis_flip"].max() < 1e-3
 
 
 @pytest.mark.parametrize("degrees", [69, 178, 179, 180])
 def test_the_joint_region_of_the_retardance_vector_covers_at_180_degrees_too(degrees: float) -> None:
     m = triply_degenerate.mueller_matrix(mueller.retarder(0.4, np.deg2rad(degrees)) @ mueller.rotation(0.2), 0.9)
-    found, truth = block(m, 200), block(m, 1e13)["retardance_vector_deg"].reshape(3, -1)[:, :1]
-    packed = found["retardance_vector_covariance"].reshape(6, -1)
+    maps, truth = block(m, 200), block(m, 1e13)["retardance_vector_deg"].reshape(3, -1)[:, :1]
+    packed = maps["retardance_vector_covariance"].reshape(6, -1)
     covariance = np.moveaxis(packed[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3, -1), -1, 0)
     inverse = np.linalg.inv(covariance.astype(float))
     # The same retarder, turned the other way round.
     same = (truth, truth - 360 * truth / np.linalg.norm(truth))
-    errors = [found["retardance_vector_deg"].reshape(3, -1) - vector for vector in same]
+    errors = [maps["retardance_vector_deg"].reshape(3, -1) - vector for vector in same]
     distance = np.min([np.einsum("ip,pij,jp->p", error, inverse, error) for error in errors], axis=0)
     # Chi-square of three degrees of freedom.
     assert np.mean(distance) == pytest.approx(3, abs=0.5)
@@ -207,9 +209,9 @@ def test_the_joint_region_of_the_retardance_vector_covers_at_180_degrees_too(deg
 
 
 def test_noise_alone_is_taken_off_what_td_misses() -> None:
-    found = block(triply_degenerate.mueller_matrix(nineteen_samples()["non-depolarizing"], 0.6), 200)
-    assert np.median(found["td_missed"]) < 0.4 * np.median(found["td_missed_noise"])
-    assert np.mean(found["td_missed_95"][0] == 0) > 0.9
+    maps = block(triply_degenerate.mueller_matrix(nineteen_samples()["non-depolarizing"], 0.6), 200)
+    assert np.median(maps["td_missed"]) < 0.4 * np.median(maps["td_missed_noise"])
+    assert np.mean(maps["td_missed_95"][0] == 0) > 0.9
 
 
 @pytest.mark.parametrize("covariance", [(1.0, 1.0, 0.0), (1.0, 0.04, 0.1), (0.02, 1.0, -0.1)])
@@ -218,21 +220,21 @@ def test_a_direction_covers_at_every_length_under_any_noise(length: float, covar
     xx, yy, xy = covariance
     noise = np.linalg.cholesky([[xx, xy], [xy, yy]]) @ np.random.default_rng(4).normal(size=(2, 20_000))
     vector = noise + np.array([[0.8 * length], [0.6 * length]])
-    found = directions(vector, np.array(covariance)[:, None] * np.ones(20_000))
+    intervals = directions(vector, np.array(covariance)[:, None] * np.ones(20_000))
     off = np.arctan2(0.6, 0.8) - np.arctan2(*vector[::-1])
     off -= 2 * np.pi * np.round(off / (2 * np.pi))
     # All directions where the vector may be zero: then more often.
-    assert np.mean((found.low <= off) & (off <= found.high)) > 0.945
+    assert np.mean((intervals.low <= off) & (off <= intervals.high)) > 0.945
     if length == 8:
-        assert np.mean((found.low <= off) & (off <= found.high)) == pytest.approx(0.95, abs=0.01)
+        assert np.mean((intervals.low <= off) & (off <= intervals.high)) == pytest.approx(0.95, abs=0.01)
 
 
 @pytest.mark.parametrize("quantity", ["diattenuation_linear", "diattenuation", "depolarization_index", "entropy"])
 def test_noise_that_differs_between_directions_is_known(quantity: str) -> None:
     """With states of condition 80 the covariance left out m00, and 68 and 95 % intervals covered 58 and 84 to 90 %."""
     samples = ["mirror-like", "det < 0", "DoLP 0.2", "triply degenerate"]
-    found = list(cells("24 others", 0, 20_000, 1000, samples=samples, extra=()))
-    mine = [cell for cell in found if cell.quantity == quantity]
+    table = list(cells("24 others", 0, 20_000, 1000, samples=samples, extra=()))
+    mine = [cell for cell in table if cell.quantity == quantity]
     assert len(mine) == 4
     assert min(cell.in_68 for cell in mine) > 0.6
     assert min(cell.in_95 for cell in mine) > 0.915
@@ -250,31 +252,31 @@ def test_entropy_covers_at_both_its_ends_and_where_an_eigenvalue_may_be_zero(ins
 
 def test_an_axis_that_is_not_determined_has_its_whole_period_about_its_value() -> None:
     """That of the differential decomposition had 0 to 180 degrees, which counts as a miss where it passes 180."""
-    found = cells("127 degrees, 9 to 1, 41", 0, 60, 200, samples=["retarder 2"], first_seed=21)
-    cell = next(c for c in found if c.quantity == "differential_retardance_fast_axis_deg")
+    table = cells("127 degrees, 9 to 1, 41", 0, 60, 200, samples=["retarder 2"], first_seed=21)
+    cell = next(c for c in table if c.quantity == "differential_retardance_fast_axis_deg")
     assert cell.all_95 > 0.9
     assert cell.in_95 > 0.95
 
 
 def test_where_m00_is_noise_every_interval_is_everything() -> None:
     """Without light enough the ratio to m00 is no normal variate: 95 % intervals covered 43 %."""
-    found = list(cells("24 others", 0, 20, 400, samples=["mirror", "retarder 2", "ideal depolarizer"], extra=EXTRA))
-    for cell in found:
+    table = list(cells("24 others", 0, 20, 400, samples=["mirror", "retarder 2", "ideal depolarizer"], extra=EXTRA))
+    for cell in table:
         if cell.quantity not in ("mueller", "dominant_mueller_jones"):
             assert cell.in_95 > 0.93, cell
 
 
 @pytest.mark.parametrize("true", [0.0, 0.3, 1.0, 3.0, 6.0])
 def test_an_interval_of_what_is_not_negative_covers(true: float) -> None:
-    seen = true + np.random.default_rng(5).normal(size=40_000)
-    for (low, high), level in zip(positive(seen), (0.683, 0.95), strict=True):
+    values = true + np.random.default_rng(5).normal(size=40_000)
+    for (low, high), level in zip(positive(values), (0.683, 0.95), strict=True):
         assert np.mean((low <= true) & (true <= high)) == pytest.approx(level, abs=0.01)
 
 
 @pytest.mark.parametrize("instrument", list(seven_instruments())[1:])
 def test_poor_states_have_intervals_that_cover_too(instrument: str) -> None:
-    found = list(
+    table = list(
         cells(instrument, 0, 20_000, PIXELS, samples=["triply degenerate", "retarder 90", "mirror-like"], extra=())
     )
-    low = [c for c in found if c.in_68 < LEAST_68 or c.in_95 < LEAST_95]
+    low = [c for c in table if c.in_68 < LEAST_68 or c.in_95 < LEAST_95]
     assert len(low) <= 3, low

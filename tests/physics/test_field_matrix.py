@@ -18,22 +18,22 @@ def test_pseudo_inverse_with_two_retardance_maps(configs: Path) -> None:
     def pinv(y: float, x: float) -> np.ndarray:
         generator = model.generator[1].model_copy(update={"retardance_deg": 127.12 + 4 * x - 2 * y + 3 * x * x})
         analyzer = model.analyzer[0].model_copy(update={"retardance_deg": 94.78 + 5 * x * y - 3 * y})
-        here = model.model_copy(
+        pixel = model.model_copy(
             update={"generator": (model.generator[0], generator), "analyzer": (analyzer, model.analyzer[1])}
         )
-        return np.asarray(np.linalg.pinv(here.rows(angles)[:, 0]))
+        return np.asarray(np.linalg.pinv(pixel.rows(angles)[:, 0]))
 
-    found = FieldMatrix.of(pinv, "W changes")
-    assert len(found.polynomials) < 12  # of the 81 that a grid of 9 x 9 nodes has
+    field = FieldMatrix.of(pinv, "W changes")
+    assert len(field.polynomials) < 12  # of the 81 that a grid of 9 x 9 nodes has
     y, x = np.array([-1.0, -0.31, 0.77]), np.array([-0.9, 0.05, 0.4, 1.0])
-    weights = found.weights(y, x)
+    weights = field.weights(y, x)
     vector = np.random.default_rng(1).normal(size=40).astype(np.float32)
     columns = np.repeat(vector[:, None], 12, axis=1)
-    product = found.times(weights, columns)
+    product = field.times(weights, columns)
     for k in range(12):
         true = pinv(y[k // 4], x[k % 4])
         np.testing.assert_allclose(product[:, k], true @ vector, atol=3 * TOLERANCE * np.abs(true).max() * 40)
-        guess = np.einsum("k,krc->rc", weights[:, k], found.stack.reshape(-1, 16, 40))
+        guess = np.einsum("k,krc->rc", weights[:, k], field.stack.reshape(-1, 16, 40))
         assert np.abs(guess - true).max() < 2 * TOLERANCE * np.abs(true).max()
 
 

@@ -10,7 +10,7 @@ ODD = np.array([0.2, -0.3, 1.0, 0.4, 0.1])
 
 
 @pytest.mark.parametrize(
-    "made",
+    "run",
     [
         lambda: filters.separable(IMAGE, ODD, ODD[1:4]),
         lambda: filters.separable(IMAGE.astype(float), ODD, ODD[1:4], "reflect"),
@@ -18,15 +18,15 @@ ODD = np.array([0.2, -0.3, 1.0, 0.4, 0.1])
         lambda: filters.box(IMAGE, 7),
     ],
 )
-def test_without_opencv_the_same(made, monkeypatch):
-    fast = made()
+def test_without_opencv_the_same(run, monkeypatch):
+    fast = run()
     monkeypatch.setattr(filters, "cv2", None)
-    slow = made()
+    slow = run()
     assert slow.dtype == fast.dtype
     assert np.allclose(slow, fast, rtol=3e-6)
 
 
 def test_parts_are_means_of_their_pixels():
-    whole = filters.block_means(np.arange(24).reshape(4, 6), 2, 3)
-    assert whole.tolist() == [[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]]
+    means = filters.block_means(np.arange(24).reshape(4, 6), 2, 3)
+    assert means.tolist() == [[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]]
     assert np.allclose(filters.block_means(np.array([[1.0, 2.0, 6.0]]), 1, 2), [[4 / 3, 14 / 3]])

@@ -45,9 +45,9 @@ def test_sound_frames_and_a_drifting_lamp_are_no_evidence(rows, seed):
 def test_one_state_of_another_exposure_is_named(rows, seed, factor):
     blocks, state = pictures(rows, seed), 3 + 3 * seed
     blocks[state] *= factor
-    (found,) = judge(rows, blocks)
-    assert (found.kind, found.state) == ("brightness", 4 + state)
-    assert f"state {4 + state} alone" in found.text
+    (evidence,) = judge(rows, blocks)
+    assert (evidence.kind, evidence.state) == ("brightness", 4 + state)
+    assert f"state {4 + state} alone" in evidence.text
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -55,10 +55,10 @@ def test_one_state_of_another_exposure_is_named(rows, seed, factor):
 def test_a_gain_that_changes_on_the_way_is_named(rows, seed, factor):
     blocks, state = pictures(rows, seed), 4 + 3 * seed
     blocks[state:] *= factor
-    found = judge(rows, blocks)
-    assert [f.kind for f in found] == ["brightness"] * len(found)
-    assert found[0].state == 4 + state
-    assert float(re.search(r"is (\S+) times", found[0].text)[1]) == pytest.approx(factor, rel=0.02)
+    evidence = judge(rows, blocks)
+    assert [f.kind for f in evidence] == ["brightness"] * len(evidence)
+    assert evidence[0].state == 4 + state
+    assert float(re.search(r"is (\S+) times", evidence[0].text)[1]) == pytest.approx(factor, rel=0.02)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -68,8 +68,8 @@ def test_a_mirrored_picture_is_named(rows, seed, flip, onwards):
     blocks, state = pictures(rows, seed), 5 + 5 * seed
     for k in range(state, STATES) if onwards else (state,):
         blocks[k] = blocks[k][flip]
-    (found,) = judge(rows, blocks)
-    assert (found.kind, found.state) == ("picture", 4 + state)
+    (evidence,) = judge(rows, blocks)
+    assert (evidence.kind, evidence.state) == ("picture", 4 + state)
 
 
 def nearly_symmetric(rows, seed, odd, wander=2.0):
@@ -89,9 +89,9 @@ def test_a_picture_upside_down_of_a_nearly_symmetric_sample_is_named_where_its_o
         blocks, state = nearly_symmetric(rows, seed, odd=0.1), 3 * seed + 2
         assert mirrored_pictures(np.arange(STATES), rows, blocks) == []
         blocks[state] = blocks[state][::-1]
-        found = [f.state for f in mirrored_pictures(np.arange(STATES), rows, blocks)]
-        assert found in ([state], [])
-        named += len(found)
+        states = [f.state for f in mirrored_pictures(np.arange(STATES), rows, blocks)]
+        assert states in ([state], [])
+        named += len(states)
     assert named >= 6
 
 
@@ -101,9 +101,9 @@ def test_noise_does_not_hide_a_smooth_odd_part(rows):
     for seed in range(96):
         blocks, state = nearly_symmetric(rows, seed, odd=1e-3, wander=0.0), (7 * seed + 3) % STATES
         blocks[state] = blocks[state][::-1]
-        found = [f.state for f in mirrored_pictures(np.arange(STATES), rows, blocks)]
-        assert found in ([state], [])
-        named += len(found)
+        states = [f.state for f in mirrored_pictures(np.arange(STATES), rows, blocks)]
+        assert states in ([state], [])
+        named += len(states)
     assert named >= 46
 
 
@@ -136,10 +136,10 @@ def test_a_frame_that_came_before_is_noticed_whole_and_in_part():
 
 def test_numbers_and_times_that_stand_are_noticed():
     evidence = FrameEvidence(64.0, None)
-    known = {"exposure_s": 0.01, "light": True}
-    assert evidence.look(0, frame(0), number=1, camera_ns=10, **known) == []
-    assert [f.kind for f in evidence.look(1, frame(1), number=1, camera_ns=20, **known)] == ["number"]
-    assert [f.kind for f in evidence.look(2, frame(2), number=2, camera_ns=20, **known)] == ["time"]
+    settings = {"exposure_s": 0.01, "light": True}
+    assert evidence.look(0, frame(0), number=1, camera_ns=10, **settings) == []
+    assert [f.kind for f in evidence.look(1, frame(1), number=1, camera_ns=20, **settings)] == ["number"]
+    assert [f.kind for f in evidence.look(2, frame(2), number=2, camera_ns=20, **settings)] == ["time"]
     # A camera without a clock, or without numbers.
-    assert evidence.look(3, frame(3), number=0, camera_ns=0, **known) == []
-    assert evidence.look(4, frame(4), number=0, camera_ns=0, **known) == []
+    assert evidence.look(3, frame(3), number=0, camera_ns=0, **settings) == []
+    assert evidence.look(4, frame(4), number=0, camera_ns=0, **settings) == []

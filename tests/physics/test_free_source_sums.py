@@ -49,18 +49,18 @@ def test_states_apart_in_tiles_are_what_a_column_for_each_of_them_says():
     of_state = np.arange(rows)[:, None] // CHANNELS == np.arange(STATES)
     shares, sums = random.normal(size=(3, count)), []
     for wide in (True, False):
-        there = of_state if wide else np.ones((rows, 1))
+        presence = of_state if wide else np.ones((rows, 1))
         slopes = TileSlopes(
-            at_nodes=at_nodes * there,
+            at_nodes=at_nodes * presence,
             shares=shares,
             fields=np.array([1]),
-            da=(0.1 * np.ones((1, count, rows, 1))) * there,
+            da=(0.1 * np.ones((1, count, rows, 1))) * presence,
             counted=np.array([2]),
             dc=dc,
         )
         out = Sums.empty(2, VALUES)
         add_tiles(
-            data, moments, moments.tiles, a * there, c=c, slopes=slopes, out=out, apart=None if wide else CHANNELS
+            data, moments, moments.tiles, a * presence, c=c, slopes=slopes, out=out, apart=None if wide else CHANNELS
         )
         sums.append(out)
     for name in sizes:

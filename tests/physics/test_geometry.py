@@ -53,9 +53,9 @@ def test_rusinkiewicz_angles_equal_the_definition_by_rotations():
 
 def test_directions_is_the_inverse_of_angles():
     rng = np.random.default_rng(1)
-    wanted = rng.uniform([0.01, 0.01, -3.1], [1.2, 1.2, 3.1], size=(100, 3))
-    got = rusinkiewicz.angles(*rusinkiewicz.directions(*wanted.T))
-    np.testing.assert_allclose(np.stack(got, axis=-1), wanted, atol=1e-12)
+    truth = rng.uniform([0.01, 0.01, -3.1], [1.2, 1.2, 3.1], size=(100, 3))
+    got = rusinkiewicz.angles(*rusinkiewicz.directions(*truth.T))
+    np.testing.assert_allclose(np.stack(got, axis=-1), truth, atol=1e-12)
 
 
 def test_angles_are_finite_where_phi_d_is_undefined():
@@ -79,10 +79,10 @@ def test_change_of_frames_is_undone_by_the_way_back_and_keeps_a_depolarizer():
     n, wi, wo = random_directions(40)
     g = ScatteringGeometry(n, wi, wo)
     m = np.random.default_rng(2).normal(size=(40, 4, 4))
-    there = change_frames(m, g, n)
-    back = change_frames(there, g.with_up(n), [0.0, 1.0, 0.0])
+    turned = change_frames(m, g, n)
+    back = change_frames(turned, g.with_up(n), [0.0, 1.0, 0.0])
     np.testing.assert_allclose(back, m, atol=1e-12)
-    assert np.abs(there - m).max() > 0.1
+    assert np.abs(turned - m).max() > 0.1
     np.testing.assert_allclose(
         change_frames(mueller.IDEAL_DEPOLARIZER, g, n), np.tile(mueller.IDEAL_DEPOLARIZER, (40, 1, 1))
     )

@@ -81,9 +81,9 @@ def test_mesh_of_a_sphere_equals_the_sphere(tmp_path):
     mesh = ViewingGeometry(camera=CAMERA, source_distance_mm=672.7, shape=Mesh(file=str(tmp_path / "ball.ply")))
     ball = mesh.model_copy(update={"shape": Sphere(radius_mm=12.7)})
     a, b = mesh.at(40), ball.at(40)
-    both = a.mask & b.mask
+    overlap = a.mask & b.mask
     assert (a.mask ^ b.mask).mean() < 0.01
-    difference = a.fill(a.points.normal)[both] - b.fill(b.points.normal)[both]
+    difference = a.fill(a.points.normal)[overlap] - b.fill(b.points.normal)[overlap]
     assert np.percentile(np.linalg.norm(difference, axis=1), 99) < 0.02
 
 
@@ -205,15 +205,15 @@ def test_camera_pose_command_writes_a_camera_file(tmp_path, capsys):
     for name, image in images:
         files.append(str(tmp_path / f"{name}.png"))
         cv2.imwrite(files[-1], image)
-    given = ["--squares", "8x6", "--square-mm", "5", "--marker-mm", "3.6", "--pixel-mm", "0.01"]
+    board = ["--squares", "8x6", "--square-mm", "5", "--marker-mm", "3.6", "--pixel-mm", "0.01"]
     out = tmp_path / "camera.yaml"
     with pytest.raises(SystemExit) as end:
-        main(["camera-pose", *files, *given, "--out", str(out)])
+        main(["camera-pose", *files, *board, "--out", str(out)])
     assert end.value.code == 0
     assert "reprojection error" in capsys.readouterr().out
     assert load_yaml(out, PinholeCamera).focal_length_mm == pytest.approx(20, rel=0.02)
     with pytest.raises(SystemExit) as end:
-        main(["camera-pose", *files, "--squares", "eight", *given[2:], "--out", str(out)])
+        main(["camera-pose", *files, "--squares", "eight", *board[2:], "--out", str(out)])
     assert end.value.code == 2
     assert "8x6" in capsys.readouterr().err
 

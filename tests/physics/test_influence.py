@@ -27,13 +27,13 @@ def written(configs):
 
 
 def test_a_degree_of_retardance_changes_air_by_what_a_degree_does(written):
-    told = {one.name: one for one in influences(written, 662.0)}
-    assert len(told) == 4
+    changes = {influence.name: influence for influence in influences(written, 662.0)}
+    assert len(changes) == 4
     # One element of M, in the plane of the plate, moves by up to one degree: 0.0175 over the root of 15 elements.
-    assert 0.002 < told["psg_retardance[psg_retarder] at 662 nm"].change < 0.0175
+    assert 0.002 < changes["psg_retardance[psg_retarder] at 662 nm"].change < 0.0175
     # 0.02 degrees of the analyzer turn some elements of M by 0.04 degrees.
-    assert told["analyzer.azimuth_deg"].change == pytest.approx(2 * 0.02 / 57.3 * (2 / 15) ** 0.5, rel=0.5)
-    assert told["tone_curve at 662 nm"].change is None
+    assert changes["analyzer.azimuth_deg"].change == pytest.approx(2 * 0.02 / 57.3 * (2 / 15) ** 0.5, rel=0.5)
+    assert changes["tone_curve at 662 nm"].change is None
 
 
 def test_the_command_says_for_which_captures(written, tmp_path):

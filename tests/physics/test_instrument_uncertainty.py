@@ -89,14 +89,14 @@ def products(synthetic_capture, tmp_path, model, truth, random, name="a", **more
 
 
 def read(paths):
-    found = {}
+    maps = {}
     for path, names in zip(paths[1:], (TOLD, ("xi0",)), strict=True):
         with Product(path) as product:
             for name in names:
                 ends = product.get(f"{name}_95") if f"{name}_95" in product.names else None
                 systematic = product.get(f"{name}_systematic") if f"{name}_systematic" in product.names else 0.0
-                found[name] = (product.get(name), product.get(f"{name}_errors"), systematic, ends)
-    return found
+                maps[name] = (product.get(name), product.get(f"{name}_errors"), systematic, ends)
+    return maps
 
 
 def test_a_file_states_them_with_the_values(stated, configs):
@@ -104,7 +104,7 @@ def test_a_file_states_them_with_the_values(stated, configs):
     assert model.at(662).stderr == U
     assert model.at(451).stderr == {}
     assert model.model_copy(update={"stderr": {}}) == plain
-    assert {one.label: one.u for one in value_directions(model.at(662))} == U
+    assert {direction.label: direction.u for direction in value_directions(model.at(662))} == U
     with pytest.raises(ConfigError, match=r"psg_retarder.retardance_deg.*0 or more"):
         parse_yaml(stated.read_text().replace("u: 0.3", "u: -0.3"), InstrumentModel)
 
@@ -114,8 +114,10 @@ def test_correlated_values_move_together(stated):
         "correlations:\n  - between: [psg_retarder.azimuth_deg, analyzer.azimuth_deg]\n    coefficients: [0.96]\n"
     )
     model = parse_yaml(text, InstrumentModel).at(662)
-    moved = [one.moved for one in value_directions(model) if "&" in one.label]
-    off = np.array([[other.value_of(n) - model.value_of(n) for n in model.correlations[0].between] for other in moved])
+    moved = [direction.moved for direction in value_directions(model) if "&" in direction.label]
+    off = np.array(
+        [[variant.value_of(n) - model.value_of(n) for n in model.correlations[0].between] for variant in moved]
+    )
     assert off.T @ off == pytest.approx(0.01 * np.array([[1, 0.96], [0.96, 1]]), abs=1e-9)
 
 
@@ -127,8 +129,8 @@ def test_total_intervals_cover_drawn_instruments(stated, synthetic_capture, tmp_
     exact = read(products(synthetic_capture, tmp_path, model, model, None, "exact"))
     inside, alone, pulls = ({name: [] for name in (*TOLD, "xi0")} for _ in range(3))
     for k in range(30):
-        found = read(products(synthetic_capture, tmp_path, model, drawn(model, random), random, f"r{k}"))
-        for name, (value, error, systematic, ends) in found.items():
+        maps = read(products(synthetic_capture, tmp_path, model, drawn(model, random), random, f"r{k}"))
+        for name, (value, error, systematic, ends) in maps.items():
             off = value - exact[name][0].mean()
             pulls[name].append(np.square(off / np.hypot(error, systematic)).mean())
             inside[name].append(((value - off >= ends[0]) & (value - off <= ends[1])).mean())
@@ -176,8 +178,8 @@ def test_a_table_holds_what_each_direction_does_to_its_means(stated, synthetic_c
     with Product(paths[2]) as product:
         of_pixel = np.median(product.get("xi0_systematic"))
     assert np.median(table.uncertainties["u_systematic"]) == pytest.approx(of_pixel, rel=0.05)
-    known = model.model_copy(update={"stderr": {}})
-    plain = products(synthetic_capture, tmp_path, known, known, None, "plain", **header)
+    exact_model = model.model_copy(update={"stderr": {}})
+    plain = products(synthetic_capture, tmp_path, exact_model, exact_model, None, "plain", **header)
     with pytest.raises(ProcessError, match="process reduce --instrument"):
         tabulate([plain[2]], geometry, "degree", table)
 
@@ -186,7 +188,7 @@ def test_a_table_holds_what_each_direction_does_to_its_means(stated, synthetic_c
 def test_a_mueller_table_covers_an_instrument_that_is_off_and_its_noise(stated, synthetic_capture, tmp_path, configs):
     """One uncertain value off by u moves every element of every bin by its direction; the noise is that of repeats."""
     model = InstrumentModel.load(stated).at(662)
-    known = model.model_copy(update={"stderr": {}})
+    exact_model = model.model_copy(update={"stderr": {}})
     off = model.with_values({"psg_retarder": {"retardance_deg": model.value_of("psg_retarder.retardance_deg") + 0.3}})
     geometry, header = configs / "geometries/one_inch_sphere.yaml", {"omega_deg": 35.0, "rows": 32}
 
@@ -194,16 +196,20 @@ def test_a_mueller_table_covers_an_instrument_that_is_off_and_its_noise(stated, 
         image = mueller_image(synthetic_capture, tmp_path, used, truth, random, name, **header)
         return tabulate([image], geometry, "renderer")
 
-    exact, moved, told = table(known, known, None, "e"), table(known, off, None, "m"), table(model, known, None, "t")
+    exact, moved, declared = (
+        table(exact_model, exact_model, None, "e"),
+        table(exact_model, off, None, "m"),
+        table(model, exact_model, None, "t"),
+    )
     assert set(exact.uncertainties) == {"u_noise"}
-    one = told.directions[told.inputs.index(f"psg_retarder.retardance_deg ({model.identity})")]
+    direction = declared.directions[declared.inputs.index(f"psg_retarder.retardance_deg ({model.identity})")]
     # What the instrument really does is the opposite of what a wrong file does.
     shift = moved.mean / moved.mean[0] - exact.mean / exact.mean[0]
     assert np.abs(shift).max() > 1e-3
-    assert -one / told.mean[0] == pytest.approx(shift, rel=0.02, abs=1e-5)
-    assert np.all(told.uncertainties["u_systematic"] ** 2 >= one**2)
+    assert -direction / declared.mean[0] == pytest.approx(shift, rel=0.02, abs=1e-5)
+    assert np.all(declared.uncertainties["u_systematic"] ** 2 >= direction**2)
     random = np.random.default_rng(1)
-    repeats = [table(known, known, random, f"n{k}") for k in range(24)]
+    repeats = [table(exact_model, exact_model, random, f"n{k}") for k in range(24)]
     pulls = [(r.mean - exact.mean) / r.uncertainties["u_noise"] for r in repeats]
     # 24 repeats of some 100 bins in each element.
     assert np.sqrt(np.mean(np.square(pulls), axis=(0, 2))) == pytest.approx(np.ones(16), abs=0.1)
@@ -229,10 +235,10 @@ def test_what_two_instruments_do_to_a_table_adds_as_squares(stated, synthetic_ca
         assert u_systematic(2, 0, 3) == pytest.approx(alone * np.sqrt(5) / 3, rel=1e-4, abs=1e-9)
     view = ViewingGeometry.load(geometry)
     of_a, of_b, of_c = (tabulate([paths[k][2]], geometry, "degree") for k in range(3))
-    same, other = (compare_on_sphere(of_a, table, view, 35.0, shape=(32, 32)) for table in (of_b, of_c))
+    same, independent = (compare_on_sphere(of_a, table, view, 35.0, shape=(32, 32)) for table in (of_b, of_c))
     assert same["xi0_systematic_percent"] == pytest.approx(0, abs=1e-6)
     size = 100 * np.sqrt(2 * np.mean(np.square(of_a.uncertainties["u_systematic"])))
-    assert other["xi0_systematic_percent"] == pytest.approx(size, rel=0.2)
+    assert independent["xi0_systematic_percent"] == pytest.approx(size, rel=0.2)
 
 
 def sphere_capture(synthetic_capture, configs, truth, name, **kind):
@@ -272,10 +278,10 @@ def test_the_instruments_uncertainty_reaches_fitted_constants(stated, synthetic_
         geometry = configs / "geometries/one_inch_sphere.yaml"
         fits.append(fit_products([product], geometry, correlation=kind == "correlation")[0])
     exact, nominal = fits
-    moved, told = nominal.constants - exact.constants, np.sqrt(np.diag(nominal.systematic))
+    moved, error = nominal.constants - exact.constants, np.sqrt(np.diag(nominal.systematic))
     assert np.abs(moved[0]) > 1e-4
     assert not exact.systematic.any()
-    assert told == pytest.approx(np.abs(moved), rel=0.15, abs=2e-4)
+    assert error == pytest.approx(np.abs(moved), rel=0.15, abs=2e-4)
     assert nominal.chi_square < 1.1 * exact.chi_square + 0.05
     assert any("the instrument's uncertainty: n" in note for note in nominal.notes(["a"]))
 
@@ -286,14 +292,16 @@ def test_compared_tables_share_the_error_of_one_instrument(configs):
     angles = view.at(35.0, 60, 60).points.angles
 
     def table(value, moved, label):
-        made = ScatteringTable(("xi0",), 662, has_noise=True, inputs=(label,))
-        made.add(angles, np.broadcast_to(np.array([[value], [0.0], [moved]]), (3, angles.theta_h.size)))
-        return made
+        entries = ScatteringTable(("xi0",), 662, has_noise=True, inputs=(label,))
+        entries.add(angles, np.broadcast_to(np.array([[value], [0.0], [moved]]), (3, angles.theta_h.size)))
+        return entries
 
-    for other, expected in (("analyzer", 1.0), ("micropolarizer", np.hypot(3.0, 4.0))):
-        found = compare_on_sphere(table(0.5, 0.03, "analyzer"), table(0.6, 0.04, other), view, 35.0, shape=(60, 60))
-        assert found["xi0_percent"] == pytest.approx(10)
-        assert found["xi0_systematic_percent"] == pytest.approx(expected)
+    for source, expected in (("analyzer", 1.0), ("micropolarizer", np.hypot(3.0, 4.0))):
+        comparison = compare_on_sphere(
+            table(0.5, 0.03, "analyzer"), table(0.6, 0.04, source), view, 35.0, shape=(60, 60)
+        )
+        assert comparison["xi0_percent"] == pytest.approx(10)
+        assert comparison["xi0_systematic_percent"] == pytest.approx(expected)
 
 
 def test_an_extrapolated_matrix_and_its_quantities_have_the_instruments_part(configs, synthetic_capture, tmp_path):
@@ -311,29 +319,29 @@ def test_an_extrapolated_matrix_and_its_quantities_have_the_instruments_part(con
     light = np.nan_to_num(triply_degenerate.mueller_matrix(m0, np.full((64, 76), 0.5), np.full((64, 76), 4e6)))
     intensity = np.einsum("ck,xyk->cxy", true.rows({"": np.zeros(1)})[0], light.reshape(64, 76, 16))
     for (r, c), channel in np.ndenumerate(np.array(model.mosaic)):
-        index = [one.name for one in model.channels].index(channel)
+        index = [product_maps.name for product_maps in model.channels].index(channel)
         frames[0, 0, r::2, c::2] = intensity[index, r::2, c::2]
     path = synthetic_capture(frames, {}, name="s.h5", mosaic=model.mosaic, detector=detector, **header)
-    found = []
+    products = []
     for used in (true, model.model_copy(update={"stderr": {name: u}})):
-        stokes, whole, maps = (tmp_path / f"{len(found)}.{kind}.h5" for kind in ("stokes", "m", "q"))
+        stokes, mueller, maps = (tmp_path / f"{len(products)}.{kind}.h5" for kind in ("stokes", "m", "q"))
         with Capture(path) as capture:
             reduce_stokes(capture, used, stokes, (STEP,))
-        extrapolate_mueller(stokes, *scene, whole, step=STEP, overwrite=False)
-        quantities_of_mueller(whole, maps, STEP)
-        with Product(whole) as product, Product(maps) as derived:
+        extrapolate_mueller(stokes, *scene, mueller, step=STEP, overwrite=False)
+        quantities_of_mueller(mueller, maps, STEP)
+        with Product(mueller) as product, Product(maps) as derived:
             names = [n for n in derived.names if n.startswith("depolarization_index")]
-            found.append({n: product.get(n) for n in product.names} | {n: derived.get(n) for n in names})
-    exact, nominal = found
+            products.append({n: product.get(n) for n in product.names} | {n: derived.get(n) for n in names})
+    exact, nominal = products
     inside = (exact["valid"] > 0) & (nominal["valid"] > 0) & (np.abs(m0[..., 0, 1]) > 0.05)
     assert inside.sum() > 300
-    m, other = (one["mueller"][..., inside] for one in found)
+    m, m_nominal = (product_maps["mueller"][..., inside] for product_maps in products)
     index = "depolarization_index"
-    for moved, told in (
-        (other / other[0, 0] - m / m[0, 0], nominal["mueller_systematic"][..., inside] / other[0, 0]),
+    for moved, error in (
+        (m_nominal / m_nominal[0, 0] - m / m[0, 0], nominal["mueller_systematic"][..., inside] / m_nominal[0, 0]),
         ((nominal[index] - exact[index])[inside], nominal[f"{index}_systematic"][inside]),
     ):
         assert np.abs(moved).max() > 5e-4
         # To first order: a fifth of the largest is of second.
-        assert told == pytest.approx(np.abs(moved), rel=0.1, abs=2e-4)
-        assert np.linalg.norm(told) == pytest.approx(np.linalg.norm(moved), rel=0.05)
+        assert error == pytest.approx(np.abs(moved), rel=0.1, abs=2e-4)
+        assert np.linalg.norm(error) == pytest.approx(np.linalg.norm(moved), rel=0.05)

@@ -13,36 +13,36 @@ def matrix(rows: int, columns: int = 16, seed: int = 0) -> np.ndarray:
 
 def test_an_inversion_holds_the_inverse_and_what_it_cannot_explain():
     w = matrix(20)
-    found = Inversion.of(w)
-    np.testing.assert_allclose(found.pinv @ w, np.eye(16), atol=1e-12)
+    inverse = Inversion.of(w)
+    np.testing.assert_allclose(inverse.pinv @ w, np.eye(16), atol=1e-12)
     # The residual's rows see nothing that W explains, are orthonormal, and are all there are.
-    assert found.null.shape == (4, 20)
-    np.testing.assert_allclose(found.null @ w, 0, atol=1e-12)
-    np.testing.assert_allclose(found.null @ found.null.T, np.eye(4), atol=1e-12)
-    assert (found.rank, found.degrees_of_freedom) == (16, 4)
-    assert found.condition_number == pytest.approx(np.linalg.cond(w))
-    np.testing.assert_array_equal(found.basis, np.eye(16))
-    assert found.w is w
+    assert inverse.null.shape == (4, 20)
+    np.testing.assert_allclose(inverse.null @ w, 0, atol=1e-12)
+    np.testing.assert_allclose(inverse.null @ inverse.null.T, np.eye(4), atol=1e-12)
+    assert (inverse.rank, inverse.degrees_of_freedom) == (16, 4)
+    assert inverse.condition_number == pytest.approx(np.linalg.cond(w))
+    np.testing.assert_array_equal(inverse.basis, np.eye(16))
+    assert inverse.w is w
     # Independent noise of one in every intensity.
-    np.testing.assert_allclose(found.unit_covariance, np.linalg.inv(w.T @ w), atol=1e-12)
+    np.testing.assert_allclose(inverse.unit_covariance, np.linalg.inv(w.T @ w), atol=1e-12)
 
 
 def test_a_partial_polarimeter_is_inverted_among_what_it_determines():
     basis = np.eye(16)[:, :9]
     w = matrix(12, 9) @ basis.T
-    found = Inversion.of(w, basis=basis)
-    assert (found.rank, found.degrees_of_freedom, found.null.shape) == (9, 3, (3, 12))
-    np.testing.assert_allclose(found.pinv @ w, basis @ basis.T, atol=1e-12)
-    assert found.condition_number == pytest.approx(np.linalg.cond(w @ basis))
-    np.testing.assert_array_equal(found.basis, basis)
+    inverse = Inversion.of(w, basis=basis)
+    assert (inverse.rank, inverse.degrees_of_freedom, inverse.null.shape) == (9, 3, (3, 12))
+    np.testing.assert_allclose(inverse.pinv @ w, basis @ basis.T, atol=1e-12)
+    assert inverse.condition_number == pytest.approx(np.linalg.cond(w @ basis))
+    np.testing.assert_array_equal(inverse.basis, basis)
 
 
 def test_what_the_states_do_not_see_is_named():
     w = matrix(20)
     w[:, [6, 12]] = 0.0
-    with pytest.raises(NotDetermined) as told:
+    with pytest.raises(NotDetermined) as refusal:
         Inversion.of(w, "a.h5: ")
-    assert str(told.value).startswith(
+    assert str(refusal.value).startswith(
         "a.h5: the measurement matrix W has rank 14, and 16 are needed: 20 intensities a pixel do not determine "
         "m12, m30 (each alone"
     )
@@ -56,11 +56,11 @@ def test_planes_are_multiplied_tile_by_tile_after_their_offset(pixels, offset):
     random = np.random.default_rng(1)
     frames = random.integers(0, 4096, (5, pixels)).astype(np.uint16)
     each = random.uniform(0, 30, pixels).astype(np.float32)
-    taken = each if offset == "each" else np.float32(offset)
+    dark = each if offset == "each" else np.float32(offset)
     m = matrix(3, 5).astype(np.float32)
     out = np.full((3, pixels), np.nan, dtype=np.float32)
-    multiply_tiles(m, frames, out, taken if offset == "each" else offset)
-    np.testing.assert_allclose(out, m @ (frames - taken), rtol=2e-5, atol=0.05)
+    multiply_tiles(m, frames, out, dark if offset == "each" else offset)
+    np.testing.assert_allclose(out, m @ (frames - dark), rtol=2e-5, atol=0.05)
 
 
 def test_frames_may_be_of_any_type_and_without_black():
@@ -73,12 +73,12 @@ def test_frames_may_be_of_any_type_and_without_black():
 
 def test_mueller_elements_of_frames():
     w, m = matrix(20), matrix(16, 50, seed=2)
-    found = Inversion.of(w)
+    inverse = Inversion.of(w)
     frames = 1000 * w @ m
-    planes = mueller_planes(found, frames)
+    planes = mueller_planes(inverse, frames)
     assert (planes.shape, planes.dtype) == ((16, 50), np.float32)
     np.testing.assert_allclose(planes, 1000 * m, atol=0.05)
     # The black goes off every frame, and memory that is given is used.
     out = np.empty((16, 50), dtype=np.float32)
-    assert mueller_planes(found, frames + 64.0, out, 64.0) is out
+    assert mueller_planes(inverse, frames + 64.0, out, 64.0) is out
     np.testing.assert_allclose(out, 1000 * m, atol=0.05)

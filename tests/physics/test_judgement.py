@@ -19,7 +19,7 @@ FALLS = (Check(name="rms", before=2.0, after=1.0, holds=True),)
 
 
 @pytest.mark.parametrize(
-    ("named", "sure", "structure", "seen", "verdict"),
+    ("named", "sure", "structure", "visible", "verdict"),
     [
         (False, False, False, True, "consistent"),
         (False, False, False, False, "undetermined"),
@@ -30,8 +30,8 @@ FALLS = (Check(name="rms", before=2.0, after=1.0, holds=True),)
         (True, True, False, False, "explained"),
     ],
 )
-def test_verdict_of_names_and_what_is_left(named, sure, structure, seen, verdict) -> None:
-    assert Judgement(named, sure, structure, seen, FALLS).verdict == verdict
+def test_verdict_of_names_and_what_is_left(named, sure, structure, visible, verdict) -> None:
+    assert Judgement(named, sure, structure, visible, FALLS).verdict == verdict
 
 
 def test_what_makes_the_residual_worse_explains_nothing() -> None:
@@ -59,5 +59,5 @@ def test_where_no_pixel_shows_xi0_nothing_is_said_of_it(monkeypatch) -> None:
     monkeypatch.setattr(quantities, "xi0_of", lambda *of: np.full(5, np.nan))
     assert quantities.chances(problem, solved, np.eye(1)) == ()
     monkeypatch.setattr(quantities, "xi0_of", lambda problem, k, space, values: np.append(0.1 * values, np.nan))
-    told = quantities.change_of_xi0(problem, solved, 0.01 * np.eye(1))
-    assert (told.size, told.stderr) == pytest.approx((0.1, 0.0071), abs=1e-4)
+    change = quantities.change_of_xi0(problem, solved, 0.01 * np.eye(1))
+    assert (change.size, change.stderr) == pytest.approx((0.1, 0.0071), abs=1e-4)

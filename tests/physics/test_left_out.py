@@ -57,10 +57,10 @@ def test_a_frame_that_belongs_to_nothing_is_found_among_faults(configs, tmp_path
     bench = TrueBench(rows=SIDE, columns=SIDE)
     small_faults(bench)
     bench.level.append(lambda k, a: 0.75 if k == state else 1.0)
-    found = screened_capture(taken(tmp_path, configs, bench, 3, air), configs)
-    assert list(found.left_out.frames) == [state]
-    assert not found.row_counts[state]
-    assert found.left_out.frames[state] > 0.1
+    data = screened_capture(taken(tmp_path, configs, bench, 3, air), configs)
+    assert list(data.left_out.frames) == [state]
+    assert not data.row_counts[state]
+    assert data.left_out.frames[state] > 0.1
 
 
 @pytest.mark.parametrize("air", [True, False])
@@ -71,9 +71,9 @@ def test_two_frames_in_each_others_place_are_found_among_faults(configs, tmp_pat
     small_faults(bench)
     bench.order = np.arange(STATES)
     bench.order[list(pair)] = pair[::-1]
-    found = screened_capture(taken(tmp_path, configs, bench, 3, air), configs).left_out
-    assert tuple(found.frames) == found.exchanged == pair
-    assert min(found.frames.values()) > 0.1
+    left_out = screened_capture(taken(tmp_path, configs, bench, 3, air), configs).left_out
+    assert tuple(left_out.frames) == left_out.exchanged == pair
+    assert min(left_out.frames.values()) > 0.1
 
 
 def test_cosmic_rays_and_hot_pixels_are_found_and_left_out(configs, tmp_path):
@@ -91,15 +91,15 @@ def test_cosmic_rays_and_hot_pixels_are_found_and_left_out(configs, tmp_path):
         return after
 
     bench.noise.append(spoil)
-    found = screened_capture(taken(tmp_path, configs, bench, 5, air=False), configs)
-    assert [8, 30] in found.left_out.pixels.tolist()
-    hits = {(n, y, x) for n, _, y, x in found.left_out.hits.tolist()}
+    data = screened_capture(taken(tmp_path, configs, bench, 5, air=False), configs)
+    assert [8, 30] in data.left_out.pixels.tolist()
+    hits = {(n, y, x) for n, _, y, x in data.left_out.hits.tolist()}
     true = {(n, y, x) for n, y, x in np.argwhere(truth).tolist() if (y, x) != (8, 30)}
-    bad = {tuple(p) for p in found.left_out.pixels.tolist()}
+    bad = {tuple(p) for p in data.left_out.pixels.tolist()}
     # A pixel that was struck several times may be called bad.
     assert len([t for t in true if t not in hits and t[1:] not in bad]) <= 0.03 * len(true)
     assert len(hits - true) <= 0.01 * len(true)
-    assert not found.usable[truth.any(axis=0)][3:].all()
+    assert not data.usable[truth.any(axis=0)][3:].all()
 
 
 def test_hits_are_found_pixel_by_pixel_where_means_are_fitted(configs, tmp_path, monkeypatch):
@@ -112,12 +112,12 @@ def test_hits_are_found_pixel_by_pixel_where_means_are_fitted(configs, tmp_path,
         return electrons
 
     bench.noise.append(strike)
-    found = screened_capture(taken(tmp_path, configs, bench, 5, air=False), configs)
-    assert found.binned == 2
-    assert found.signal.shape == (STATES, 1, SIDE // 2, SIDE // 2)
-    assert found.left_out.hits.tolist() == [[7, 0, 21, 10]]
-    assert found.left_out.pitch == 1
-    assert not found.usable[10, 5]
+    data = screened_capture(taken(tmp_path, configs, bench, 5, air=False), configs)
+    assert data.binned == 2
+    assert data.signal.shape == (STATES, 1, SIDE // 2, SIDE // 2)
+    assert data.left_out.hits.tolist() == [[7, 0, 21, 10]]
+    assert data.left_out.pitch == 1
+    assert not data.usable[10, 5]
 
 
 def test_cosmic_rays_are_found_where_it_is_dark(configs, tmp_path):
@@ -132,19 +132,19 @@ def test_cosmic_rays_are_found_where_it_is_dark(configs, tmp_path):
         return electrons
 
     bench.noise.append(strike)
-    found = screened_capture(taken(tmp_path, configs, bench, 5, air=False), configs)
-    hits = {(n, y, x) for n, _, y, x in found.left_out.hits.tolist()}
+    data = screened_capture(taken(tmp_path, configs, bench, 5, air=False), configs)
+    hits = {(n, y, x) for n, _, y, x in data.left_out.hits.tolist()}
     true = set(map(tuple, struck.tolist()))
     assert len(true - hits) <= 0.02 * len(true)
     assert not hits - true
-    assert not len(found.left_out.pixels)
+    assert not len(data.left_out.pixels)
 
 
 def mean_error(image: MuellerImage, good: np.ndarray) -> float:
     """Largest error of an element of M/m00 of air, mean over the image."""
     with np.errstate(invalid="ignore"):
-        found = (image.values / image.values[0, 0])[..., good].mean(axis=-1)
-    return float(np.abs(found - np.eye(4)).max())
+        mean = (image.values / image.values[0, 0])[..., good].mean(axis=-1)
+    return float(np.abs(mean - np.eye(4)).max())
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -176,10 +176,10 @@ def test_a_struck_intensity_does_not_count(configs, tmp_path):
     with Capture(path) as capture:
         frames = np.stack([capture.frames(k)[0, 4, 5] for k in range(STATES)]).astype(float) - 100
     w = model.rows(state_angles(STATES, False, False))
-    rest = np.delete(np.arange(STATES), 3)
-    expected = np.linalg.lstsq(w.reshape(STATES, 16)[rest], frames[rest], rcond=None)[0]
-    found = MuellerImage.load(tmp_path / "a.h5").values[:, :, 4, 5].reshape(16)
-    assert found == pytest.approx(expected, rel=1e-3, abs=1e-3 * expected[0])
+    states = np.delete(np.arange(STATES), 3)
+    expected = np.linalg.lstsq(w.reshape(STATES, 16)[states], frames[states], rcond=None)[0]
+    estimate = MuellerImage.load(tmp_path / "a.h5").values[:, :, 4, 5].reshape(16)
+    assert estimate == pytest.approx(expected, rel=1e-3, abs=1e-3 * expected[0])
 
 
 def test_stokes_of_a_mosaic_leave_out_states_and_struck_pixels(synthetic_capture, configs, tmp_path) -> None:
@@ -196,8 +196,8 @@ def test_stokes_of_a_mosaic_leave_out_states_and_struck_pixels(synthetic_capture
     entry = {"capture": name, "states": [3], "hits": [[1, 0, 2, 4]], "pixels": [[6, 8]], "pitch": 2}
     result = tmp_path / "result.json"
     result.write_text(json.dumps({"left_out": [entry]}))
-    made = Reduction(path, demosaic="superpixel", leave_out=result).make(tmp_path / "s.h5")
-    with Product(made) as product:
+    result_file = Reduction(path, demosaic="superpixel", leave_out=result).make(tmp_path / "s.h5")
+    with Product(result_file) as product:
         s0, mask = product.get("s0"), product.get("pixel_flags")
     lost = np.zeros((4, 6), dtype=bool)
     lost[1, 2] = lost[3, 4] = True
@@ -221,11 +221,11 @@ def test_effects_count_the_states_that_a_diagnosis_saw(configs, tmp_path):
         )
     )
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
-    told = model.model_copy(update={"effects": (slip, flicker)})
+    declared = model.model_copy(update={"effects": (slip, flicker)})
     errors = []
     for left_out in (Exclusions(), Exclusions(states=(4,))):
         with Capture(path) as capture:
-            reduce_mueller(capture, told, tmp_path / "m.h5", (), left_out=left_out, overwrite=True)
+            reduce_mueller(capture, declared, tmp_path / "m.h5", (), left_out=left_out, overwrite=True)
         image = MuellerImage.load(tmp_path / "m.h5")
         errors.append(mean_error(image, image.mask == 0))
     assert errors[1] == pytest.approx(errors[0], abs=1e-3)

@@ -69,18 +69,18 @@ def test_dark_darks_of_a_light_in_the_noise_pass(light: float) -> None:
 
 
 @pytest.mark.parametrize("mosaic", [True, False])
-@pytest.mark.parametrize(("light", "seen"), [(0.0, False), (3.0, True), (900.0, True)])
-def test_light_states_that_are_as_dark_as_the_darks_are_told_once(mosaic: bool, light: float, seen: bool) -> None:
+@pytest.mark.parametrize(("light", "is_visible"), [(0.0, False), (3.0, True), (900.0, True)])
+def test_light_states_that_are_as_dark_as_the_darks_are_told_once(mosaic: bool, light: float, is_visible: bool) -> None:
     for seed in range(10):
         look = LitDarks(BLACK, mosaic=mosaic, lights=12)
         look.dark(0.01, POSES[0], frame(0.0, 100 + seed))
-        told = []
+        remarks = []
         for k, pose in enumerate(POSES):
             # Crossed polarizers in every second pose.
             assert look.light(0.01, pose, frame(light * (k % 2 or mosaic), 1000 * seed + k)) is None
-            told.append(look.without_light(0.01))
-        texts = [text for text in told if text is not None]
-        assert len(texts) == (0 if seen else 1)
+            remarks.append(look.without_light(0.01))
+        texts = [text for text in remarks if text is not None]
+        assert len(texts) == (0 if is_visible else 1)
         assert all("the light states of 0.01 s are no brighter than the dark ones" in text for text in texts)
         assert look.without_light(0.02) is None
 

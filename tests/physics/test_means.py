@@ -45,16 +45,16 @@ def test_means_of_1024_pixels_hold_their_errors(plain, synthetic_capture, tmp_pa
     """Every number of 20 means: all within a few of their errors, 95 % inside their intervals."""
     random = np.random.default_rng(11)
     bright = mueller_product(synthetic_capture, tmp_path, plain, plain, random, "bright", 100.0)
-    truth = {one.name: one.value for one in mean_of([bright], WHOLE)}
+    truth = {mean.name: mean.value for mean in mean_of([bright], WHOLE)}
     assert truth["depolarization_index"] == pytest.approx(float(depolarization_index(SAMPLE)), abs=0.001)
     inside, pulls = {}, {}
     for k in range(20):
         product = mueller_product(synthetic_capture, tmp_path, plain, plain, random, f"m{k}")
-        for one in mean_of([product], WHOLE):
-            if one.name == "m00" or one.unit == "degree":
+        for mean in mean_of([product], WHOLE):
+            if mean.name == "m00" or mean.unit == "degree":
                 continue
-            inside.setdefault(one.name, []).append(one.low <= truth[one.name] <= one.high)
-            pulls.setdefault(one.name, []).append((one.value - truth[one.name]) / one.u_noise)
+            inside.setdefault(mean.name, []).append(mean.low <= truth[mean.name] <= mean.high)
+            pulls.setdefault(mean.name, []).append((mean.value - truth[mean.name]) / mean.u_noise)
     elements = [name for name in pulls if name.startswith("m")]
     assert len(elements) == 15
     assert np.sqrt(np.mean([np.square(pulls[name]) for name in elements])) == pytest.approx(1, abs=0.12)
@@ -71,7 +71,7 @@ def test_a_mosaic_mean_knows_what_neighbours_share(configs, synthetic_capture, t
     model = InstrumentModel.load(configs / "instruments/linear_stokes.yaml").at(662)
     expected = model.rows({"": np.zeros(1)})[0] @ SAMPLE.reshape(16) * 4000
     where = {c: (r, k) for r, line in enumerate(model.mosaic) for k, c in enumerate(line)}
-    pulls, found = [], {}
+    pulls, by_name = [], {}
     for k in [*range(25), None]:
         frames = np.zeros((1, 1, 64, 64))
         for channel, level in zip((c.name for c in model.channels), expected, strict=True):
@@ -82,27 +82,27 @@ def test_a_mosaic_mean_knows_what_neighbours_share(configs, synthetic_capture, t
         with Capture(path) as capture:
             reduce_stokes(capture, model, tmp_path / f"s{k}.stokes.h5", (STEP,))
         means = mean_of([tmp_path / f"s{k}.stokes.h5"], (slice(16, 48), slice(16, 48)))
-        found[k] = {one.name: one for one in means}
+        by_name[k] = {mean.name: mean for mean in means}
     for k in range(25):
         names = ("s0", "s1_over_s0", "s2_over_s0", "dolp")
-        pulls.append([(found[k][n].value - found[None][n].value) / found[k][n].u_noise for n in names])
+        pulls.append([(by_name[k][n].value - by_name[None][n].value) / by_name[k][n].u_noise for n in names])
     assert np.sqrt(np.mean(np.square(pulls), axis=0)) == pytest.approx(np.ones(4), abs=0.4)
     assert np.abs(pulls).max() < 4
     with Product(tmp_path / "s0.stokes.h5") as product:
         alone = np.sqrt(np.square(product.get("s1_errors")[16:48, 16:48]).sum()) / 1024 / product.get("s0").mean()
-    assert found[0]["s1_over_s0"].u_noise > 1.5 * alone
+    assert by_name[0]["s1_over_s0"].u_noise > 1.5 * alone
 
 
 def test_the_instrument_does_not_average_and_scatter_of_captures_counts(stated, synthetic_capture, tmp_path):  # noqa: F811
     random = np.random.default_rng(8)
     model = InstrumentModel.load(stated).at(662)
-    one = mueller_product(synthetic_capture, tmp_path, model, model, random, "one")
-    quarter = {v.name: v for v in mean_of([one], (slice(0, 16), slice(0, 16)))}
-    whole = {v.name: v for v in mean_of([one], WHOLE)}
+    capture = mueller_product(synthetic_capture, tmp_path, model, model, random, "one")
+    quarter = {v.name: v for v in mean_of([capture], (slice(0, 16), slice(0, 16)))}
+    image = {v.name: v for v in mean_of([capture], WHOLE)}
     name = "m11_over_m00"
-    assert whole[name].u_noise == pytest.approx(quarter[name].u_noise / 2, rel=0.05)
-    assert whole[name].u_systematic == pytest.approx(quarter[name].u_systematic, rel=0.05)
-    part = next(c for c in whole[name].budget if c.source.startswith("psg_retarder.retardance_deg (RGB950"))
+    assert image[name].u_noise == pytest.approx(quarter[name].u_noise / 2, rel=0.05)
+    assert image[name].u_systematic == pytest.approx(quarter[name].u_systematic, rel=0.05)
+    part = next(c for c in image[name].budget if c.source.startswith("psg_retarder.retardance_deg (RGB950"))
     assert part.u == pytest.approx(abs(part.sensitivity) * 0.3)
     # A bench that is mounted anew for each capture: its scatter, with few degrees of freedom.
     anew = [
@@ -129,9 +129,9 @@ def test_what_two_instruments_do_averages(stated, synthetic_capture, tmp_path): 
     assert shared.u_systematic == pytest.approx(alone.u_systematic, rel=0.05)
     assert apart.u_systematic == pytest.approx(alone.u_systematic / np.sqrt(2), rel=0.05)
     assert len(apart.budget) == 2 * len(shared.budget) - 1
-    known = model.model_copy(update={"stderr": {}})
+    exact_model = model.model_copy(update={"stderr": {}})
     with pytest.raises(ProcessError, match="not of one kind"):
-        mean_of([of_one[0], mueller_product(synthetic_capture, tmp_path, known, model, random, "d")], WHOLE)
+        mean_of([of_one[0], mueller_product(synthetic_capture, tmp_path, exact_model, model, random, "d")], WHOLE)
 
 
 def test_the_command_writes_csv_json_and_a_budget(stated, synthetic_capture, tmp_path):  # noqa: F811
@@ -139,13 +139,13 @@ def test_the_command_writes_csv_json_and_a_budget(stated, synthetic_capture, tmp
     product = mueller_product(synthetic_capture, tmp_path, model, model, np.random.default_rng(1))
     table, tree = tmp_path / "means.csv", tmp_path / "means.json"
     command = ["mean", str(product), "--region", "0:32,0:32", "--out"]
-    told = CliRunner().invoke(app, [*command, str(table), "--budget", "depolarization_index"])
-    assert told.exit_code == 0, told.output
-    assert "psg_retarder.retardance_deg" in told.output
-    assert "U95" in told.output
+    result = CliRunner().invoke(app, [*command, str(table), "--budget", "depolarization_index"])
+    assert result.exit_code == 0, result.output
+    assert "psg_retarder.retardance_deg" in result.output
+    assert "U95" in result.output
     assert CliRunner().invoke(app, [*command, str(tree)]).exit_code == 0
     rows = list(csv.DictReader(line for line in table.read_text().splitlines() if not line.startswith("#")))
-    means = {one["name"]: one for one in json.loads(tree.read_text())["means"]}
+    means = {mean["name"]: mean for mean in json.loads(tree.read_text())["means"]}
     assert {row["name"] for row in rows} == set(means)
     row = next(row for row in rows if row["name"] == "depolarization_index")
     assert float(row["value"]) == pytest.approx(float(depolarization_index(SAMPLE)), abs=0.02)

@@ -125,8 +125,8 @@ def test_an_elliptical_analyzer_transmits_its_own_state_and_no_other():
     np.testing.assert_allclose(mueller.polarizer(0.3, 0.0, 0.5)[0], row, atol=1e-12)
     leaky = mueller.polarizer(0.7, 0.02, 0.3)
     state = np.array([1, np.cos(0.6) * np.cos(1.4), np.cos(0.6) * np.sin(1.4), np.sin(0.6)])
-    other = state * [1, -1, -1, -1]
-    np.testing.assert_allclose([leaky @ state, leaky @ other], [state, 0.02 * other], atol=1e-12)
+    orthogonal = state * [1, -1, -1, -1]
+    np.testing.assert_allclose([leaky @ state, leaky @ orthogonal], [state, 0.02 * orthogonal], atol=1e-12)
     np.testing.assert_allclose(mueller.polarizer(0.7, 0.01, 1e-12), mueller.polarizer(0.7, 0.01), atol=1e-11)
     text = "{kind: polarizer, name: e, azimuth_deg: 20, ellipticity_deg: {value: 45, u: 0.5}}"
     model = InstrumentModel.model_validate(
@@ -148,6 +148,6 @@ def test_a_residual_that_is_equal_everywhere_correlates_with_nothing():
     """The mean of 600 times this number rounds to another one: its standard deviation is not zero."""
     numbers = np.linspace(1, 2, 500, dtype=np.float32)
     number = next(x for x in numbers if np.full(600, np.sqrt(x * x)).std() > 0)
-    left = np.full((1, 20, 30), number, dtype=np.float32)
-    signal = np.broadcast_to(np.arange(30, dtype=np.float32), left.shape)
-    assert correlates_of(left, signal, np.ones((20, 30), dtype=bool)) == {}
+    residual = np.full((1, 20, 30), number, dtype=np.float32)
+    signal = np.broadcast_to(np.arange(30, dtype=np.float32), residual.shape)
+    assert correlates_of(residual, signal, np.ones((20, 30), dtype=bool)) == {}

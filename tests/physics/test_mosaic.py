@@ -38,10 +38,10 @@ def mosaic(channels: np.ndarray, layout: MosaicLayout = LAYOUT) -> np.ndarray:
 def test_even_light_stays_even(method: str, dtype: type) -> None:
     values = np.array([120.0, 80.0, 40.0, 82.0])
     channels = np.broadcast_to(values[:, None, None], (4, 24, 28))
-    found = demosaic(mosaic(channels).astype(dtype), LAYOUT, method)
-    assert found.dtype == np.float32
-    assert found.shape == ((4, 12, 14) if method == "superpixel" else (4, 24, 28))
-    np.testing.assert_allclose(found, np.broadcast_to(values[:, None, None], found.shape), rtol=2e-3)
+    planes = demosaic(mosaic(channels).astype(dtype), LAYOUT, method)
+    assert planes.dtype == np.float32
+    assert planes.shape == ((4, 12, 14) if method == "superpixel" else (4, 24, 28))
+    np.testing.assert_allclose(planes, np.broadcast_to(values[:, None, None], planes.shape), rtol=2e-3)
 
 
 @pytest.mark.parametrize("method", FULL_SIZE)
@@ -49,10 +49,10 @@ def test_gradients_and_the_place_of_the_pixels(method: str) -> None:
     y, x = np.indices((40, 48), dtype=float)
     stokes = np.stack([1000 + 6 * x + 3 * y, 200 + 2 * x, 100 - 1.5 * y])
     truth = np.tensordot(ANALYZERS, stokes, axes=1)
-    found = demosaic(mosaic(truth), LAYOUT, method)
+    planes = demosaic(mosaic(truth), LAYOUT, method)
     inner = np.s_[:, 8:-8, 8:-8]
     # Half a pixel of shift would be an error of 2 counts or more in every channel.
-    assert np.max(np.abs(found[inner] - truth[inner])) < 0.7
+    assert np.max(np.abs(planes[inner] - truth[inner])) < 0.7
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -60,10 +60,10 @@ def test_any_arrangement_of_the_super_pixel(method: str) -> None:
     rng = np.random.default_rng(1)
     stokes = np.stack([1000 + 50 * rng.normal(size=(32, 32)), np.full((32, 32), 300.0), np.full((32, 32), -200.0)])
     truth = np.tensordot(ANALYZERS, stokes, axes=1)
-    other = MosaicLayout.of((("0", "135"), ("45", "90")), NAMES, ANALYZERS)
-    turned = demosaic(mosaic(truth, other), other, method)
+    layout = MosaicLayout.of((("0", "135"), ("45", "90")), NAMES, ANALYZERS)
+    turned = demosaic(mosaic(truth, layout), layout, method)
     # The same scene turned by 180 degrees has the first arrangement.
-    straight = demosaic(mosaic(truth, other)[::-1, ::-1].copy(), LAYOUT, method)[:, ::-1, ::-1]
+    straight = demosaic(mosaic(truth, layout)[::-1, ::-1].copy(), LAYOUT, method)[:, ::-1, ::-1]
     inner = np.s_[:, 5:-5, 5:-5]
     np.testing.assert_allclose(turned[inner], straight[inner], atol=0.2)
 
@@ -76,7 +76,7 @@ def test_noise_of_stokes_is_what_the_covariance_says(method: str) -> None:
     channels = np.broadcast_to(values[:, None, None], (4, 200, 200))
     sigma = np.sqrt(np.broadcast_to(variance[:, None, None], channels.shape))
     solve = np.linalg.pinv(ANALYZERS)
-    found = np.stack(
+    vectors = np.stack(
         [
             np.tensordot(
                 solve, demosaic(mosaic(channels + sigma * rng.normal(size=sigma.shape)), LAYOUT, method), axes=1
@@ -84,18 +84,18 @@ def test_noise_of_stokes_is_what_the_covariance_says(method: str) -> None:
             for _ in range(4)
         ]
     )
-    shape = found.shape[2:]
-    told = stokes_covariance(
+    shape = vectors.shape[2:]
+    covariance = stokes_covariance(
         np.broadcast_to(variance[:, None, None], (4, *shape)).astype(np.float32), LAYOUT, method, solve
     )
     truth = solve @ values
     inner = np.s_[..., 10:-10, 10:-10]
-    deviation = (found - truth[None, :, None, None])[inner]
+    deviation = (vectors - truth[None, :, None, None])[inner]
     pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     for k, (a, b) in enumerate(pairs):
         measured = np.mean(deviation[:, a] * deviation[:, b])
-        scale = np.sqrt(np.mean(told[a][inner]) * np.mean(told[b][inner]))
-        assert measured / scale == pytest.approx(np.mean(told[k][inner]) / scale, abs=0.06), (a, b)
+        scale = np.sqrt(np.mean(covariance[a][inner]) * np.mean(covariance[b][inner]))
+        assert measured / scale == pytest.approx(np.mean(covariance[k][inner]) / scale, abs=0.06), (a, b)
 
 
 @pytest.mark.parametrize("electrons", [20.0, 200.0, 20_000.0])
@@ -107,16 +107,16 @@ def test_every_pixel_has_an_interval_of_its_degree_and_angle_of_polarization(
     light = electrons * np.array([2.0, 2 * polarized * 0.6, -2 * polarized * 0.8])
     expected = mosaic(np.broadcast_to((ANALYZERS @ light)[:, None, None], (4, *size)))
     frame = (random.poisson(expected) + random.normal(0, 2.3, size)).astype(np.float32)
-    one = np.ones((1, 1), np.float32)
-    merged = MergedFrame(frame, np.zeros(size, np.uint8), one, one * np.float32(2.3**2))
+    unit = np.ones((1, 1), np.float32)
+    merged = MergedFrame(frame, np.zeros(size, np.uint8), unit, unit * np.float32(2.3**2))
     channels = demosaic(frame, LAYOUT, DEFAULT_METHOD)
-    found = stokes(channels, ANALYZERS, LAYOUT, DEFAULT_METHOD, merged=merged, frame=frame)
-    turn = (found["aolp_deg"] - np.rad2deg(np.arctan2(-0.8, 0.6)) / 2 + 90) % 180 - 90
-    for name, error in {"dolp": found["dolp"] - polarized, "aolp_deg": turn}.items():
+    maps = stokes(channels, ANALYZERS, LAYOUT, DEFAULT_METHOD, merged=merged, frame=frame)
+    turn = (maps["aolp_deg"] - np.rad2deg(np.arctan2(-0.8, 0.6)) / 2 + 90) % 180 - 90
+    for name, error in {"dolp": maps["dolp"] - polarized, "aolp_deg": turn}.items():
         if name == "aolp_deg" and not polarized:
             continue
-        low, high = found[f"{name}_95"] - found[name]
-        assert 0.62 < np.mean(np.abs(error) <= found[f"{name}_errors"]) < 0.76, name
+        low, high = maps[f"{name}_95"] - maps[name]
+        assert 0.62 < np.mean(np.abs(error) <= maps[f"{name}_errors"]) < 0.76, name
         assert 0.9 < np.mean((low <= -error) & (-error <= high)) < 0.98, name
 
 
@@ -135,21 +135,21 @@ def test_noise_of_an_adaptive_method_is_that_of_its_weights_there(method: str) -
         for _ in range(30)
     ]
     variance = np.full((4, *frame.shape), sigma**2, np.float32)
-    told = stokes_covariance(variance, LAYOUT, method, solve, frame=frame.astype(np.float32))
+    covariance = stokes_covariance(variance, LAYOUT, method, solve, frame=frame.astype(np.float32))
     inner = np.s_[..., 10:-10, 10:-10]
     for k in range(3):
-        found = np.var(np.stack([r[k] for r in runs]), axis=0, ddof=1)
+        scatter = np.var(np.stack([r[k] for r in runs]), axis=0, ddof=1)
         for chosen in (used > 0, used == 0):
-            ratio = np.median((found / told[k])[inner][chosen[inner]])
+            ratio = np.median((scatter / covariance[k])[inner][chosen[inner]])
             # The median of a variance from 30 runs is 0.977 of its mean.
             assert ratio == pytest.approx(0.977, abs=0.05)
 
 
 @pytest.mark.parametrize("method", [name for name, m in demosaicing_methods().items() if m.linear])
 def test_a_method_that_says_so_is_linear(method: str) -> None:
-    one, two = np.random.default_rng(4).uniform(0, 1000, (2, 24, 28))
-    parts = demosaic(one, LAYOUT, method) + demosaic(two, LAYOUT, method)
-    np.testing.assert_allclose(demosaic(one + two, LAYOUT, method), parts, atol=0.01)
+    first, second = np.random.default_rng(4).uniform(0, 1000, (2, 24, 28))
+    parts = demosaic(first, LAYOUT, method) + demosaic(second, LAYOUT, method)
+    np.testing.assert_allclose(demosaic(first + second, LAYOUT, method), parts, atol=0.01)
 
 
 def test_a_method_of_another_package_is_found_and_has_its_own_noise(monkeypatch) -> None:
@@ -168,10 +168,10 @@ def test_a_method_of_another_package_is_found_and_has_its_own_noise(monkeypatch)
         frame = (100 + 50 * x).astype(np.float32)
         variance = np.full((4, 24, 24), 9.0, np.float32)
         solve = np.linalg.pinv(ANALYZERS)
-        told = stokes_covariance(variance, LAYOUT, "larger", solve, frame=frame)[:, 4:-4, 4:-4]
+        covariance = stokes_covariance(variance, LAYOUT, "larger", solve, frame=frame)[:, 4:-4, 4:-4]
         bilinear = stokes_covariance(variance, LAYOUT, "bilinear", solve)[:, 4:-4, 4:-4]
     demosaicing_methods.cache_clear()
-    np.testing.assert_allclose(told, bilinear, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(covariance, bilinear, rtol=1e-3, atol=1e-6)
 
 
 def fractal(rng: np.random.Generator, size: int) -> Scene:
@@ -235,23 +235,23 @@ def psnr(size: int, seed: int, noise: float) -> dict[tuple[str, str], float]:
             frame[r::2, c::2] = truth[k, r::2, c::2]
         frame = np.rint(frame + rng.normal(0, noise * FULL, frame.shape)) if noise else frame
         for method in METHODS:
-            found = demosaic(frame.astype(np.float32), LAYOUT, method).astype(float)
-            if found.shape[1] < size:
-                found = np.repeat(np.repeat(found, 2, axis=1), 2, axis=2)
-            error = np.mean((truth - found)[..., 16:-16, 16:-16] ** 2)
+            planes = demosaic(frame.astype(np.float32), LAYOUT, method).astype(float)
+            if planes.shape[1] < size:
+                planes = np.repeat(np.repeat(planes, 2, axis=1), 2, axis=2)
+            error = np.mean((truth - planes)[..., 16:-16, 16:-16] ** 2)
             out[name, method] = float(10 * np.log10(FULL**2 / max(error, 1e-12)))
     return out
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_default_is_the_best_of_the_table(noise: float) -> None:
-    found = psnr(size=256, seed=11, noise=noise)
+    ratios = psnr(size=256, seed=11, noise=noise)
     for scene in SCENES:
-        best = max(METHODS, key=lambda m, s=scene: found[s, m])
-        margin = found[scene, best] - found[scene, DEFAULT_METHOD]
+        best = max(METHODS, key=lambda m, s=scene: ratios[s, m])
+        margin = ratios[scene, best] - ratios[scene, DEFAULT_METHOD]
         assert margin < 0.2, (scene, best)
-        assert found[scene, DEFAULT_METHOD] > found[scene, "difference"] - 0.1
-        assert found[scene, DEFAULT_METHOD] > found[scene, "bilinear"]
+        assert ratios[scene, DEFAULT_METHOD] > ratios[scene, "difference"] - 0.1
+        assert ratios[scene, DEFAULT_METHOD] > ratios[scene, "bilinear"]
 
 
 def test_reach_is_how_far_a_pixel_is_felt() -> None:
@@ -286,11 +286,11 @@ def test_one_pass_equals_the_long_way(dtype: type, arrangement: tuple[tuple[str,
     rng = np.random.default_rng(3)
     frame = rng.integers(1, 250, (36, 50)).astype(dtype)
     solve = np.linalg.pinv(ANALYZERS)
-    found = bilinear_stokes(frame, layout, solve)
+    vector = bilinear_stokes(frame, layout, solve)
     s = np.tensordot(solve, demosaic(frame, layout, "bilinear").astype(float), axes=1)
-    for plane, expected in zip(found[:3], s, strict=True):
+    for plane, expected in zip(vector[:3], s, strict=True):
         np.testing.assert_allclose(plane, expected, atol=2e-4)
-    np.testing.assert_allclose(found.dolp, np.hypot(s[1], s[2]) / s[0], atol=1e-5)
-    difference = (found.aolp - 0.5 * np.arctan2(s[2], s[1]) + np.pi / 2) % np.pi - np.pi / 2
+    np.testing.assert_allclose(vector.dolp, np.hypot(s[1], s[2]) / s[0], atol=1e-5)
+    difference = (vector.aolp - 0.5 * np.arctan2(s[2], s[1]) + np.pi / 2) % np.pi - np.pi / 2
     assert np.max(np.abs(difference)) < 2e-6
-    assert np.all((found.aolp >= 0) & (found.aolp <= np.float32(np.pi)))
+    assert np.all((vector.aolp >= 0) & (vector.aolp <= np.float32(np.pi)))

@@ -61,8 +61,8 @@ def test_response_is_found_and_taken_out(turning: InstrumentModel, synthetic_cap
     inner = np.s_[:, 4:-4, 4:-4]
 
     def error(frame: np.ndarray) -> float:
-        found = np.tensordot(solve, demosaic(frame, layout, "bilinear"), axes=1)
-        return float(np.sqrt(np.mean((found - stokes)[inner] ** 2)))
+        estimate = np.tensordot(solve, demosaic(frame, layout, "bilinear"), axes=1)
+        return float(np.sqrt(np.mean((estimate - stokes)[inner] ** 2)))
 
     assert error(raw) > 20
     assert error(corrected_frame(raw, response, layout, IDEAL)) < 1.5

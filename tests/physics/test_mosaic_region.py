@@ -44,7 +44,7 @@ def test_channels_may_have_any_names(synthetic_capture, configs: Path, tmp_path:
     text = (configs / "instruments" / "linear_stokes.yaml").read_text()
     renamed = re.sub(r'"(0|45|90|135)"', r"pixel_\1", text)
     frames = np.random.default_rng(3).integers(500, 2000, (1, 1, 16, 20)).astype(np.uint16)
-    found = []
+    images = []
     for k, instrument in enumerate((text, renamed)):
         file = tmp_path / f"{k}.yaml"
         file.write_text(instrument)
@@ -61,5 +61,5 @@ def test_channels_may_have_any_names(synthetic_capture, configs: Path, tmp_path:
         with Capture(path) as capture:
             reduce_stokes(capture, model.at(662.0), out, (Step("reduce", {}),), method="oriented")
         with h5py.File(out) as h5:
-            found.append(h5["entry/data/s1"][:])
-    np.testing.assert_array_equal(*found)
+            images.append(h5["entry/data/s1"][:])
+    np.testing.assert_array_equal(*images)

@@ -24,8 +24,8 @@ def captured(folder, configs, bench, scene=None):
 
 def said(model, *captures):
     """What `diagnose` says of captures, by kind whether a name is sure."""
-    found = diagnose(InstrumentProblem(model, list(captures)), lambda line: None).diagnosis
-    return found, {e.kind: e.answer for e in found.effects if e.confident}
+    diagnosis = diagnose(InstrumentProblem(model, list(captures)), lambda line: None).diagnosis
+    return diagnosis, {e.kind: e.answer for e in diagnosis.effects if e.confident}
 
 
 @pytest.mark.long
@@ -37,10 +37,10 @@ def test_a_gain_that_is_stated_some_percent_wrong_hides_no_cause(configs, tmp_pa
     bench.ellipticity = np.deg2rad(0.5)
     bench.level.append(lambda k, a: 1 + 0.01 * k / (STATES - 1))
     model, data = captured(tmp_path, configs, bench)
-    found, sure = said(model, replace(data, slope=times * data.slope, floor=times * data.floor))
-    assert found.verdict == "explained"
+    diagnosis, sure = said(model, replace(data, slope=times * data.slope, floor=times * data.floor))
+    assert diagnosis.verdict == "explained"
     assert {"psg_retardance", "source_drift"} <= set(sure)
-    assert found.error_after.chi2_reduced == pytest.approx(1.0, abs=0.01)
+    assert diagnosis.error_after.chi2_reduced == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.long
@@ -51,11 +51,11 @@ def test_an_offset_is_no_other_read_noise(configs, tmp_path):
     bench.stored.append(lambda counts: counts + 60)
     model, ball = captured(tmp_path / "ball", configs, bench, RoundSample)
     _, air = captured(tmp_path, configs, bench)
-    told = []
-    ball, air = (screen_capture(d, model, told.append) for d in (ball, air))
-    assert any("variance of a pixel" in line for line in told)
-    found, sure = said(model, ball, air)
-    assert found.noise.verdict == "as_declared"
+    lines = []
+    ball, air = (screen_capture(d, model, lines.append) for d in (ball, air))
+    assert any("variance of a pixel" in line for line in lines)
+    diagnosis, sure = said(model, ball, air)
+    assert diagnosis.noise.verdict == "as_declared"
     assert {"psa_retardance", "detector_offset"} <= set(sure)
 
 

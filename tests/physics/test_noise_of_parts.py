@@ -21,9 +21,9 @@ def test_noise_reaches_the_residual_through_the_fitted_image_where_a_feature_is_
     outside = np.eye(ROWS) - hat
     # (rows of the counts, features, rows of the noise)
     onto = np.stack([c[f][:, None] * (hat if around[f] else np.eye(ROWS)) for f in range(FEATURES)], axis=1)
-    left = np.einsum("ij,jfl->ifl", outside, onto)
-    mean = np.einsum("igl,lfg->ifl", left, noise)
-    assert part.expected[0] == pytest.approx(np.sum(left * mean))
+    onto_residual = np.einsum("ij,jfl->ifl", outside, onto)
+    mean = np.einsum("igl,lfg->ifl", onto_residual, noise)
+    assert part.expected[0] == pytest.approx(np.sum(onto_residual * mean))
 
     da, dc = random.normal(size=(2, 1, ROWS, COLUMNS)), random.normal(size=(2, 1, FEATURES, ROWS))
     moved = [

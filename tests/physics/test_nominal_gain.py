@@ -33,9 +33,9 @@ def test_four_channels_of_unequal_gain_behind_a_flickering_source(configs, tmp_p
     import_capture(
         ImportRequest(states=states, out=air, wavelength_nm=662, instrument=instrument, sample=read_sample("air"))
     )
-    found = diagnose_captures([air], nominal)[0].diagnosis
-    assert found.error_after.rms_percent == pytest.approx(0.1, abs=0.03)
-    write_instrument(tmp_path / "new.yaml", nominal, found)
+    diagnosis = diagnose_captures([air], nominal)[0].diagnosis
+    assert diagnosis.error_after.rms_percent == pytest.approx(0.1, abs=0.03)
+    write_instrument(tmp_path / "new.yaml", nominal, diagnosis)
     written = InstrumentModel.load(tmp_path / "new.yaml").at(662)
     for name, gain in GAINS.items():
         assert written.value_of(f"{name}.gain") == pytest.approx(gain, abs=0.002)

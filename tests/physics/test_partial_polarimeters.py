@@ -43,8 +43,8 @@ GAIN, READ = 2.0, 3.0
 SAMPLE = np.array([[1, 0.2, -0.1, 0.05], [0.15, 0.6, 0.1, -0.2], [-0.3, 0.05, 0.5, 0.1], [0.2, 0.1, -0.15, 0.4]])
 
 
-def names_of(seen):
-    return " ".join(f"m{k // 4}{k % 4}" for k in np.flatnonzero(seen))
+def names_of(is_determined):
+    return " ".join(f"m{k // 4}{k % 4}" for k in np.flatnonzero(is_determined))
 
 
 @pytest.fixture
@@ -75,18 +75,18 @@ def noisy(synthetic_capture, configs):
 def test_what_is_determined_is_reported_with_its_error_and_the_rest_is_not(name, weighted, noisy, tmp_path):
     elements, angles = INSTRUMENTS[name]
     path, model, scale = noisy(name, angles)
-    seen = determined_elements(determined_basis(model))
-    assert names_of(seen) == elements
+    is_determined = determined_elements(determined_basis(model))
+    assert names_of(is_determined) == elements
     with Capture(path) as capture:
         choice = Choice(weighted=weighted, covariance=weighted)
         facts = reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),), choice=choice)
-    assert (facts["rank"], facts["determined"].replace(",", "")) == (seen.sum(), elements)
+    assert (facts["rank"], facts["determined"].replace(",", "")) == (is_determined.sum(), elements)
     assert facts["median_reduced_chi_square"] == pytest.approx(1, abs=0.35)
     image = MuellerImage.load(tmp_path / "m.h5")
     values, errors = image.values.reshape(16, -1), image.errors.reshape(16, -1)
-    assert np.isnan(values[~seen]).all()
-    assert np.isnan(errors[~seen]).all()
-    pulls = (values[seen] - scale * SAMPLE.reshape(16, 1)[seen]) / errors[seen]
+    assert np.isnan(values[~is_determined]).all()
+    assert np.isnan(errors[~is_determined]).all()
+    pulls = (values[is_determined] - scale * SAMPLE.reshape(16, 1)[is_determined]) / errors[is_determined]
     count = pulls.shape[1]
     assert np.abs(pulls.mean(axis=1)).max() < 5 / np.sqrt(count)
     # Five standard deviations of the scatter of a standard deviation.
@@ -125,17 +125,17 @@ def test_quantities_are_those_that_the_elements_give(name, noisy, tmp_path):
         "aolp_deg": np.rad2deg(np.arctan2(-0.3, 0.15)) / 2 + 180,
         "ellipticity_deg": np.rad2deg(np.arctan2(0.2, np.hypot(0.15, 0.3))) / 2,
     }
-    there = {
+    quantities = {
         "rotating_retarder_stokes": {"dop", "dolp", "docp", "aolp_deg", "ellipticity_deg"},
         "rotating_analyzer": {"dolp", "aolp_deg"},
         "linear_mueller": {"polarizance_linear", "diattenuation_linear", "crossed_linear", "aligned_linear"}
         | {"polarizance_orientation_deg"},
     }[name]
     with Product(tmp_path / "q.h5") as product:
-        assert truth.keys() & set(product.names) == there
-        assert not [other for other in product.names if "eigen" in other or "retard" in other]
+        assert truth.keys() & set(product.names) == quantities
+        assert not [name_of_map for name_of_map in product.names if "eigen" in name_of_map or "retard" in name_of_map]
         assert ("polarizance" in " ".join(product.names)) == (name == "linear_mueller")
-        for quantity in there:
+        for quantity in quantities:
             pulls = (product.get(quantity) - truth[quantity]) / product.get(f"{quantity}_errors")
             assert abs(pulls.mean()) < 5 / np.sqrt(pulls.size)
             assert pulls.std() == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.size))
@@ -207,8 +207,8 @@ def test_polarized_light_has_maps_of_what_the_sample_sends_back(name, weighted, 
         truth |= {"dop": np.hypot(dolp, s[3] / s[0]), "docp": s[3] / s[0]}
         truth["ellipticity_deg"] = np.rad2deg(np.arctan2(s[3] / s[0], dolp)) / 2
     with Product(tmp_path / "q.h5") as product:
-        own = {f"{map_}_95" for map_ in truth} | {"stokes_covariance"}
-        assert set(product.names) == {"lit", "stokes", *truth, *(f"{m}_errors" for m in ("stokes", *truth)), *own}
+        extras = {f"{map_}_95" for map_ in truth} | {"stokes_covariance"}
+        assert set(product.names) == {"lit", "stokes", *truth, *(f"{m}_errors" for m in ("stokes", *truth)), *extras}
         assert product.get("lit").all()
         for map_, true in truth.items():
             pulls = (product.get(map_) - true) / product.get(f"{map_}_errors")
@@ -229,14 +229,14 @@ def test_the_covariance_of_the_stokes_vector_is_that_of_its_scatter(sent_deg, no
         stokes = product.get("stokes").reshape(4, -1)
         errors = product.get("stokes_errors").reshape(4, -1)
     scatter = np.cov(stokes)
-    found = np.diag(packed[:4])
-    found[np.triu_indices(4, 1)] = packed[4:]
-    found += np.triu(found, 1).T
+    covariance = np.diag(packed[:4])
+    covariance[np.triu_indices(4, 1)] = packed[4:]
+    covariance += np.triu(covariance, 1).T
     assert np.sqrt(packed[:4]) == pytest.approx(errors.mean(axis=1), rel=0.01)
     spread = np.sqrt(np.outer(np.diag(scatter), np.diag(scatter)) / stokes.shape[1])
-    assert np.abs((found - scatter) / spread).max() < 6
+    assert np.abs((covariance - scatter) / spread).max() < 6
     # States at unequal angles: some of it is no diagonal.
-    assert np.abs(np.triu(found, 1) / np.sqrt(np.outer(packed[:4], packed[:4]))).max() > 0.1
+    assert np.abs(np.triu(covariance, 1) / np.sqrt(np.outer(packed[:4], packed[:4]))).max() > 0.1
 
 
 @pytest.mark.parametrize("sent_deg", [None, 20.0])
@@ -267,13 +267,13 @@ def test_the_mean_of_a_stokes_polarimeter_has_the_names_of_light(sent_deg, noisy
     path, model, _ = noisy("rotating_retarder_stokes", {"psa": 22.5 * np.arange(16)}, sample=sample, sent_deg=sent_deg)
     with Capture(path) as capture:
         reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
-    found = {one.name: one for one in mean_of([tmp_path / "m.h5"], (slice(0, 30), slice(0, 40)))}
+    means = {mean.name: mean for mean in mean_of([tmp_path / "m.h5"], (slice(0, 30), slice(0, 40)))}
     truth = {"s1_over_s0": 0.3, "s2_over_s0": 0.2, "s3_over_s0": -0.4, "dolp": np.hypot(0.3, 0.2), "docp": -0.4}
     truth |= {"dop": np.sqrt(0.29), "aolp_deg": np.rad2deg(np.arctan2(0.2, 0.3)) / 2}
     truth["ellipticity_deg"] = np.rad2deg(np.arctan2(-0.4, np.hypot(0.3, 0.2))) / 2
-    assert found.keys() == {"s0", *truth}
+    assert means.keys() == {"s0", *truth}
     for name, true in truth.items():
-        assert abs(found[name].value - true) < 4 * found[name].u, name
+        assert abs(means[name].value - true) < 4 * means[name].u, name
 
 
 def titles(product):
@@ -311,11 +311,11 @@ def test_the_figure_of_a_partial_mueller_image_says_what_is_not_determined(noisy
 
 def test_states_that_see_less_than_the_instrument_can_are_refused(noisy, tmp_path):
     path, model, _ = noisy("rotating_retarder_stokes", {"psa": np.array([0.0, 90, 180, 270])})
-    with Capture(path) as capture, pytest.raises(NotDetermined, match=r"rank \d, and 4 are needed") as told:
+    with Capture(path) as capture, pytest.raises(NotDetermined, match=r"rank \d, and 4 are needed") as refusal:
         reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
     # Nothing of elements that it never sees, nor of angles of two retarders.
-    assert "m30" in str(told.value)
-    assert not any(word in str(told.value) for word in ("m01", "4.91"))
+    assert "m30" in str(refusal.value)
+    assert not any(word in str(refusal.value) for word in ("m01", "4.91"))
 
 
 def test_what_needs_the_whole_matrix_says_so(noisy, configs, tmp_path):
@@ -366,9 +366,9 @@ def test_a_known_sample_calibrates_the_train(name, synthetic_capture, configs):
     )
     with Capture(path, by_super_pixel=True) as capture:
         part = part_of(capture, nominal, slice(None), slice(None))
-    (found,) = fit_trains([part], [f"{element}.azimuth_deg"])
-    assert found.values[0] == pytest.approx(1.5, abs=5 * found.stderr[0])
-    assert found.stderr[0] < 0.1
+    (fit,) = fit_trains([part], [f"{element}.azimuth_deg"])
+    assert fit.values[0] == pytest.approx(1.5, abs=5 * fit.stderr[0])
+    assert fit.stderr[0] < 0.1
 
 
 def test_a_sample_that_does_not_see_the_train_does_not_calibrate_it(synthetic_capture, configs):

@@ -74,10 +74,10 @@ def test_without_turning_the_rows_single_precision_would_not_do(capture, monkeyp
 
 def test_derivatives_of_a_part_are_those_of_the_image(capture):
     images = capture[1].signal[:2, 0]
-    whole = derivatives_of_part(images, *(slice(0, n) for n in images.shape[1:]))
+    of_image = derivatives_of_part(images, *(slice(0, n) for n in images.shape[1:]))
     for rows, columns in ((slice(20, 31), slice(40, 52)), (slice(3, 9), slice(3, COLUMNS - 3))):
         part = derivatives_of_part(images, rows, columns)
-        assert part == pytest.approx(whole[:, :, rows, columns], abs=1e-7)
+        assert part == pytest.approx(of_image[:, :, rows, columns], abs=1e-7)
 
 
 @pytest.mark.parametrize("side", [1, 2, 3])

@@ -49,13 +49,13 @@ def intervals() -> magnitude.Interval:
 
 
 def table() -> Any:
-    made = ScatteringTable(("a", "b", "c", "d", "e"), 600.0)
+    entries = ScatteringTable(("a", "b", "c", "d", "e"), 600.0)
     values = np.random.default_rng(3).normal(size=(5, N))
     values[2, 5:9] = np.nan
     # Many samples a bin.
-    made.add(Angles(*(angle / 10 for angle in ANGLES)), values)
-    made.add(ANGLES, values)
-    return made.bins, made.count, made.mean, made.variance
+    entries.add(Angles(*(angle / 10 for angle in ANGLES)), values)
+    entries.add(ANGLES, values)
+    return entries.bins, entries.count, entries.mean, entries.variance
 
 
 def solutions() -> Any:

@@ -89,8 +89,8 @@ def test_pulls_have_unit_variance(group: Group, covariance: Array) -> None:
     truth, count = sample_matrix(), 1500
     rng = np.random.default_rng(11)
     noisy = (truth.reshape(16) + rng.multivariate_normal(np.zeros(16), covariance, size=count)).reshape(-1, 4, 4)
-    expected, found = group(truth), group(noisy)
-    for name, derived in found.items():
+    expected, estimate = group(truth), group(noisy)
+    for name, derived in estimate.items():
         sigma = np.sqrt(np.einsum("...i,ij,...j", derived.gradient, covariance, derived.gradient))
         true_value = expected[name].value[..., None]
         error = derived.value - true_value

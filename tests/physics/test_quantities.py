@@ -163,12 +163,12 @@ def test_dominant_process_of_a_depolarized_retarder_keeps_its_diattenuation() ->
 
 def test_the_components_of_purity_make_up_the_depolarization_index() -> None:
     # Gil, JOSA A 28, 1578 (2011): P_delta^2 = 2/3 P_P^2 + P_S^2; a retarder is all sphere, a polarizer all polarizance.
-    found = scalar_quantities()
+    scalars = scalar_quantities()
     m = np.random.default_rng(5).normal(size=(50, 4, 4)) * 0.2 + 3 * np.eye(4)
-    p, s = (found[name].value(m) for name in ("polarizance_purity", "spherical_purity"))
+    p, s = (scalars[name].value(m) for name in ("polarizance_purity", "spherical_purity"))
     np.testing.assert_allclose(np.sqrt(2 / 3 * p**2 + s**2), quantities.depolarization_index(m), rtol=1e-12)
     for name, of in (("spherical_purity", mueller.retarder(0.3, 1.0)), ("polarizance_purity", mueller.polarizer(0.3))):
-        assert float(found[name].value(7 * of)) == pytest.approx(1)
+        assert float(scalars[name].value(7 * of)) == pytest.approx(1)
 
 
 def test_a_file_that_is_no_quantity_is_refused() -> None:

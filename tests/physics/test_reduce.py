@@ -90,7 +90,7 @@ def test_errors_are_those_of_the_noise(case: str, rgb950: InstrumentModel, synth
     exposure: np.ndarray | float = 0.01
     response = np.ones(shape)
     repeats: np.ndarray | int = 1
-    known = detector()
+    constants = detector()
     if case == "exposures":
         exposure = 0.01 * np.where(np.arange(40) % 3, 1.0, 0.4)
         signal = signal * (exposure / 0.01)[:, None, None, None]
@@ -105,19 +105,19 @@ def test_errors_are_those_of_the_noise(case: str, rgb950: InstrumentModel, synth
     if case == "dark":
         frames = np.concatenate([noisy(rng, np.zeros((3, 1, *shape))), frames])
         role = ("dark",) * 3 + role
-        known = detector(black_level_counts=0.0)
+        constants = detector(black_level_counts=0.0)
     if case == "flat":
         many = np.mean([noisy(rng, 20000 * response[None, None]) for _ in range(40)], axis=0)
         frames = np.concatenate([np.rint(many).astype(np.uint16), frames])
         role = ("flat", *role)
     if case == "unknown gain":
-        known = {"black_level_counts": BLACK}
+        constants = {"black_level_counts": BLACK}
     extra = len(role) - 40
     padded = {axis: np.concatenate([np.full(extra, np.nan), v]) for axis, v in angles.items()}
     if extra and isinstance(exposure, float):
         exposure = np.full(len(role), exposure)
     path = synthetic_capture(
-        frames, padded, role=role, exposure_s=exposure, repeats=repeats, detector=known | {"bits": 16}
+        frames, padded, role=role, exposure_s=exposure, repeats=repeats, detector=constants | {"bits": 16}
     )
     image = reduced(path, rgb950)
     pulls = ((image.values - m) / image.errors).reshape(16, -1)
@@ -143,11 +143,11 @@ def test_covariance_is_that_of_repeated_captures(darks: int, rgb950: InstrumentM
     role = ("dark",) * darks + ("sample",) * 40
     image = reduced(synthetic_capture(frames, angles, detector=detector(bits=16), role=role), rgb950)
     deviation = (image.values - m).reshape(16, -1)
-    found = np.cov(deviation)
-    told = image.covariance().reshape(-1, 16, 16).mean(axis=0)
-    sigma = np.sqrt(np.diag(told))
+    scatter = np.cov(deviation)
+    covariance = image.covariance().reshape(-1, 16, 16).mean(axis=0)
+    sigma = np.sqrt(np.diag(covariance))
     # Correlations of 6000 samples are known to 1 / sqrt(6000) = 0.013.
-    assert np.max(np.abs((found - told) / np.outer(sigma, sigma))) < 0.08
+    assert np.max(np.abs((scatter - covariance) / np.outer(sigma, sigma))) < 0.08
 
 
 def test_black_from_dark_states_else_header_else_said(rgb950: InstrumentModel, synthetic_capture) -> None:
@@ -186,12 +186,14 @@ def test_a_capture_that_is_saturated_everywhere_leaves_no_file(rgb950: Instrumen
     assert list(path.parent.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("left", [5, 0])
+@pytest.mark.parametrize("usable_states", [5, 0])
 @pytest.mark.filterwarnings("error")
-def test_pixels_without_enough_states_are_not_determined(rgb950: InstrumentModel, synthetic_capture, left) -> None:
+def test_pixels_without_enough_states_are_not_determined(
+    rgb950: InstrumentModel, synthetic_capture, usable_states
+) -> None:
     m = scene(np.random.default_rng(6), (4, 6))
     frames = np.rint(signals(rgb950, table(), m)).astype(np.uint16)
-    frames[left:, 0, 1, 2] = 4095
+    frames[usable_states:, 0, 1, 2] = 4095
     image = reduced(synthetic_capture(frames, table(), detector=detector(bits=12, black_level_counts=0)), rgb950)
     assert image.mask[1, 2] == Mask.SATURATED | Mask.NOT_DETERMINED
     assert np.all(np.isnan(image.values[..., 1, 2]))
@@ -330,9 +332,9 @@ def test_killed_reduction_leaves_a_partial_file_that_is_resumed(
         patch.setattr(Capture, "read_block", watched)
         reduce_mueller(capture, rgb950, out, (STEP,))
     assert min(read) == done
-    whole = reduced(path, rgb950)
+    expected = reduced(path, rgb950)
     again = MuellerImage.load(out)
-    np.testing.assert_array_equal(again.values, whole.values)
-    np.testing.assert_array_equal(again.errors, whole.errors)
-    np.testing.assert_array_equal(again.mask, whole.mask)
-    assert again.facts == whole.facts
+    np.testing.assert_array_equal(again.values, expected.values)
+    np.testing.assert_array_equal(again.errors, expected.errors)
+    np.testing.assert_array_equal(again.mask, expected.mask)
+    assert again.facts == expected.facts

@@ -109,9 +109,9 @@ def test_dark_and_flat_of_another_capture(synthetic_capture) -> None:
     sample = synthetic_capture(ones * (100 + 500 * response), {}, name="sample.h5")
     dark = synthetic_capture(ones * 100, {}, role=("dark",), name="dark.h5")
     flat = synthetic_capture(ones * (100 + 2000 * response), {}, role=("flat",), name="flat.h5")
-    other = synthetic_capture(ones[..., :10] * 100, {}, role=("dark",), name="small.h5")
+    small = synthetic_capture(ones[..., :10] * 100, {}, role=("dark",), name="small.h5")
     real = synthetic_capture(ones * 100, {}, role=("dark",), name="real.h5", simulated=False)
-    with Capture(sample) as s, Capture(dark) as d, Capture(flat) as f, Capture(other) as o, Capture(real) as r:
+    with Capture(sample) as s, Capture(dark) as d, Capture(flat) as f, Capture(small) as o, Capture(real) as r:
         correction = CountCorrection.of(s, dark_from=d, flat_from=[f])
         signal = (s.frames(0) - correction.black.at(0.01)) / correction.flat.response
         np.testing.assert_allclose(signal, 500, rtol=1e-5)

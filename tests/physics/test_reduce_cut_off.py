@@ -53,9 +53,9 @@ def test_they_are_left_out_and_named(make, tmp_path):
 
 def test_too_many_left_out_are_named_where_the_rest_is_not_enough(make, tmp_path):
     path, cut = make(28)
-    with Capture(path) as capture, pytest.raises(NotDetermined, match="cut off at zero") as told:
+    with Capture(path) as capture, pytest.raises(NotDetermined, match="cut off at zero") as refusal:
         reduce_mueller(capture, capture.instrument, tmp_path / "m.h5", ())
-    assert all(str(k) in str(told.value) for k in np.flatnonzero(cut))
+    assert all(str(k) in str(refusal.value) for k in np.flatnonzero(cut))
 
 
 def test_nothing_is_left_out_where_counts_are_just_low(make, tmp_path):

@@ -33,7 +33,7 @@ MUELLER[0, 1] = MUELLER[1, 0] = 0.15
 
 
 @pytest.mark.parametrize(
-    ("exposure_s", "rate", "told"),
+    ("exposure_s", "rate", "warning"),
     [
         ([0.1, 0.1, 0.1, 0.1, 0.1, 0.1], 500.0, None),
         ([0.1, 0.1, 0.1, 0.4, 0.4, 0.4], 500.0, "Take darks at the exposures of the sample"),
@@ -42,17 +42,17 @@ MUELLER[0, 1] = MUELLER[1, 0] = 0.15
         ([0.1, 0.4, 0.1, 0.4, 0.1, 0.8], 1.0, None),
     ],
 )
-def test_what_is_told_of_the_darks(synthetic_capture, exposure_s, rate, told) -> None:
+def test_what_is_told_of_the_darks(synthetic_capture, exposure_s, rate, warning) -> None:
     exposure = np.array(exposure_s)
     frames = np.broadcast_to((64 + rate * exposure)[:, None, None, None], (6, 1, 4, 6)).astype(np.uint16)
     with Capture(synthetic_capture(frames, ANGLES, role=ROLE, exposure_s=exposure)) as capture:
         correction = CountCorrection.of(capture)
-        if told is None:
+        if warning is None:
             for k in range(2, 6):
                 np.testing.assert_allclose(correction.black.at(exposure[k]), capture.frames(k), atol=1)
     # The frames hold no light, which is told as well.
     warnings = " ".join(text for text in correction.warnings if "no brighter" not in text)
-    assert (told in warnings) if told else not warnings
+    assert (warning in warnings) if warning else not warnings
 
 
 def test_line_through_other_exposures_and_its_error() -> None:
@@ -64,10 +64,10 @@ def test_line_through_other_exposures_and_its_error() -> None:
     means = truth[:, None, None, None] + rng.normal(size=(2, 1, 200, 200)) * np.sqrt(2.0 / frames)[:, None, None, None]
     black = Black(means.astype(np.float32), exposure, frames, frames, np.full(2, 2.0), np.full(2, 0.01))
     for t in (0.02, 0.2, 0.4, 0.6):
-        found = black.at(t) - (60 + 300 * t)
+        error = black.at(t) - (60 + 300 * t)
         expected = black.weights(t)[0] ** 2 @ black.mean_variance(noise)
-        assert abs(found.mean()) < 4 * np.sqrt(expected / found.size)
-        assert found.var() == pytest.approx(expected, rel=0.03)
+        assert abs(error.mean()) < 4 * np.sqrt(expected / error.size)
+        assert error.var() == pytest.approx(expected, rel=0.03)
 
 
 def bench(instrument: InstrumentModel, level: np.ndarray, flux: float, dark_current: float, mueller: np.ndarray):
@@ -167,10 +167,10 @@ def test_calibration_leaves_out_exposures_that_saturate(synthetic_capture, confi
         frames = np.stack([capture.frames(k) for k in range(8, 88)])
         assert 0.2 < np.mean(frames >= 4095 - 64) < 0.5
         part = part_of(capture, off, slice(None), slice(None))
-        found = fit_trains([part], ["psg_retarder.retardance_deg"])[0]
+        fit = fit_trains([part], ["psg_retarder.retardance_deg"])[0]
     truth = next(e for e in model.at(662).elements() if e.name == "psg_retarder").retardance_deg
-    assert found.values[0] == pytest.approx(truth, abs=5 * found.stderr[0] + 0.01)
-    assert found.residual_over_mean < 1e-3
+    assert fit.values[0] == pytest.approx(truth, abs=5 * fit.stderr[0] + 0.01)
+    assert fit.residual_over_mean < 1e-3
 
 
 def test_hot_pixel_of_a_flat_is_a_bad_pixel(synthetic_capture) -> None:

@@ -94,8 +94,8 @@ def test_drift_of_the_source_counts_for_its_capture_alone(rgb950: InstrumentMode
     plain = error(reduced(path, rgb950), truth)
     assert plain > 0.01
     assert error(reduced(path, real), truth) < 1e-5
-    other = real.model_copy(update={"effects": (applied.model_copy(update={"captures": ("test (b.h5)",)}),)})
-    assert error(reduced(path, other), truth) == pytest.approx(plain, rel=1e-3)
+    elsewhere = real.model_copy(update={"effects": (applied.model_copy(update={"captures": ("test (b.h5)",)}),)})
+    assert error(reduced(path, elsewhere), truth) == pytest.approx(plain, rel=1e-3)
 
 
 def test_counts_are_corrected(rgb950: InstrumentModel, synthetic_capture) -> None:
@@ -207,13 +207,13 @@ def test_retardance_that_varies_over_the_image(rgb950: InstrumentModel, syntheti
     for r in range(SHAPE[0]):
         for c in range(SHAPE[1]):
             retarder = rgb950.analyzer[0].model_copy(update={"retardance_deg": 94.78 + extra[r, c]})
-            here = rgb950.model_copy(update={"analyzer": (retarder, rgb950.analyzer[1])})
-            frames[:, 0, r, c] = here.rows(ANGLES)[:, 0] @ truth[..., r, c].reshape(16)
+            pixel = rgb950.model_copy(update={"analyzer": (retarder, rgb950.analyzer[1])})
+            frames[:, 0, r, c] = pixel.rows(ANGLES)[:, 0] @ truth[..., r, c].reshape(16)
     path = synthetic_capture(frames, ANGLES, title="test")
     assert error(reduced(path, rgb950), truth) > 0.02
-    found = reduced(path, real)
-    assert error(found, truth) < 2e-4
-    assert np.nanmax(found.residual_rms) < 0.5
+    image = reduced(path, real)
+    assert error(image, truth) < 2e-4
+    assert np.nanmax(image.residual_rms) < 0.5
 
 
 def test_air_states_are_not_mixed_with_the_sample(rgb950: InstrumentModel, synthetic_capture) -> None:

@@ -78,18 +78,18 @@ def smallest_eigenvalue(planes: np.ndarray) -> np.ndarray:
 def test_nearest_is_physical_and_nearest() -> None:
     rng = np.random.default_rng(3)
     m = np.stack([pure(rng, 1.0) + rng.normal(0, 0.05, (4, 4)) for _ in range(20)]).reshape(20, 16).T
-    found = nearest(m)
-    assert np.all(smallest_eigenvalue(found) > -1e-12)
+    estimate = nearest(m)
+    assert np.all(smallest_eigenvalue(estimate) > -1e-12)
     # Nothing physical is closer: compare with a general minimizer over M = sum of Mueller-Jones matrices.
     for p in range(3):
 
         def distance(x: np.ndarray, target: np.ndarray = m[:, p]) -> float:
             factor = (x[:16] + 1j * x[16:]).reshape(4, 4)
-            made = mueller.coherency_to_mueller(factor @ factor.conj().T).reshape(16)
-            return float(np.sum((made - target) ** 2))
+            candidate = mueller.coherency_to_mueller(factor @ factor.conj().T).reshape(16)
+            return float(np.sum((candidate - target) ** 2))
 
         best = min(scipy.optimize.minimize(distance, rng.normal(size=32), method="BFGS").fun for _ in range(2))
-        assert np.sum((found[:, p] - m[:, p]) ** 2) == pytest.approx(best, rel=1e-4)
+        assert np.sum((estimate[:, p] - m[:, p]) ** 2) == pytest.approx(best, rel=1e-4)
     physical = np.stack([pure(rng, 0.7) for _ in range(5)]).reshape(5, 16).T
     np.testing.assert_allclose(nearest(physical), physical, atol=1e-12)
     physical[3, 1] = np.nan
@@ -103,8 +103,8 @@ def test_most_likely_beats_every_other_physical_matrix() -> None:
     m = np.stack([pure(rng, 1.0).reshape(16) for _ in range(6)])
     m += np.stack([rng.multivariate_normal(np.zeros(16), np.linalg.inv(f)) for f in information])
     packed = information[:, PACKED_ROW, PACKED_COLUMN].T
-    found = most_likely(m.T, packed).T
-    assert np.all(smallest_eigenvalue(found.T) > -1e-9)
+    estimate = most_likely(m.T, packed).T
+    assert np.all(smallest_eigenvalue(estimate.T) > -1e-9)
 
     def loss(x: np.ndarray, p: int) -> float:
         return float((x - m[p]) @ information[p] @ (x - m[p]))
@@ -115,12 +115,12 @@ def test_most_likely_beats_every_other_physical_matrix() -> None:
             factor = (x[:16] + 1j * x[16:]).reshape(4, 4)
             return loss(mueller.coherency_to_mueller(factor @ factor.conj().T).reshape(16), p)
 
-        values, vectors = np.linalg.eigh(mueller.coherency(found[p].reshape(4, 4)))
+        values, vectors = np.linalg.eigh(mueller.coherency(estimate[p].reshape(4, 4)))
         root = vectors * np.sqrt(np.maximum(values, 1e-6))
         start = np.concatenate([root.real.reshape(16), root.imag.reshape(16)])
         best = scipy.optimize.minimize(parametrized, start, method="BFGS").fun
-        assert loss(found[p], p) <= best + 0.01
-        assert loss(found[p], p) <= loss(nearest(m[p][:, None])[:, 0], p)
+        assert loss(estimate[p], p) <= best + 0.01
+        assert loss(estimate[p], p) <= loss(nearest(m[p][:, None])[:, 0], p)
 
 
 @pytest.mark.parametrize("physical", ["nearest", "likelihood"])
@@ -134,9 +134,9 @@ def test_physical_estimate_stands_beside_the_plain_one(
     image = reduced(path, rgb950, Choice(weighted=True, physical=physical))
     np.testing.assert_array_equal(image.values, plain.values)
     with Product(path.with_suffix(".m.h5")) as product:
-        made = product.get("mueller_physical")
-    assert np.all(smallest_eigenvalue(made.reshape(16, -1)) > -1e-3)
-    assert np.mean((made - m) ** 2) < np.mean((plain.values - m) ** 2)
+        estimate = product.get("mueller_physical")
+    assert np.all(smallest_eigenvalue(estimate.reshape(16, -1)) > -1e-3)
+    assert np.mean((estimate - m) ** 2) < np.mean((plain.values - m) ** 2)
 
 
 def test_weights_and_covariance_with_a_retardance_that_varies(rgb950, synthetic_capture) -> None:

@@ -85,8 +85,8 @@ def test_every_model_passes_the_conformance_kit():
 
 def test_first_surface_does_not_know_the_normal():
     g = random_geometry(300)
-    other = ScatteringGeometry(np.roll(g.normal, 1, axis=0), g.to_source, g.to_camera)
-    np.testing.assert_array_equal(model("first_surface").jones(g, 662), model("first_surface").jones(other, 662))
+    rotated = ScatteringGeometry(np.roll(g.normal, 1, axis=0), g.to_source, g.to_camera)
+    np.testing.assert_array_equal(model("first_surface").jones(g, 662), model("first_surface").jones(rotated, 662))
 
 
 def test_diffuse_polarizance_points_away_from_the_specular_point():

@@ -120,8 +120,8 @@ def partial_image(m, electrons, seed, generator, analyzer):
         unknown = np.full_like(image.values, np.nan)
         facts["determined"] = "S0, S1, S2"
         return replace(image, values=unknown, errors=unknown, sent=sent[:, None].astype(np.float32), facts=facts)
-    seen = np.outer(*spans).reshape(16)
-    facts["determined"] = ", ".join(f"m{k // 4}{k % 4}" for k in np.flatnonzero(seen))
+    is_determined = np.outer(*spans).reshape(16)
+    facts["determined"] = ", ".join(f"m{k // 4}{k % 4}" for k in np.flatnonzero(is_determined))
     return replace(image, facts=facts)
 
 
@@ -144,10 +144,10 @@ def test_partial_polarimeters_give_constants_without_noise_bias(sphere, name):
 def test_unpolarized_light_does_not_pretend_to_tell_what_it_cannot(sphere):
     # Here n and k run into their bounds, and what is fitted beside them is far from the truth.
     fits = [partial_fit(sphere, (np.array([[0.5, 0, 0, 0]]), SPHERE), 500, seed) for seed in range(3)]
-    known = [
+    pulls = [
         [(fit.constants[k] - TRUE[k]) / fit.stderr[k] for k in range(4) if fit.identified[NAMES[k]]] for fit in fits
     ]
-    assert np.abs(np.concatenate(known)).max(initial=0) < 4
+    assert np.abs(np.concatenate(pulls)).max(initial=0) < 4
     assert not any(fit.identified["k"] or fit.identified["a"] for fit in fits)
 
 
@@ -221,8 +221,8 @@ def apart(m: np.ndarray, rng: np.random.Generator, size: float = 0.05) -> np.nda
     m0 = xi0_and_dominant(m)[1]
     jones = np.linalg.eigh(coherency(m0))[1][..., -1].reshape(-1, 2, 2)
     seeds = [jones, *(jones @ (rng.normal(size=(2, 2)) + 1j * rng.normal(size=(2, 2))) for _ in range(3))]
-    others = np.linalg.qr(np.stack([s.reshape(-1, 4) for s in seeds], axis=2))[0][..., 1:]
-    processes = coherency_to_mueller(2 * np.einsum("nik,njk->nkij", others, others.conj()))
+    remainder = np.linalg.qr(np.stack([s.reshape(-1, 4) for s in seeds], axis=2))[0][..., 1:]
+    processes = coherency_to_mueller(2 * np.einsum("nik,njk->nkij", remainder, remainder.conj()))
     return m + m[:, :1, :1] * np.einsum("k,nkij->nij", [size / 2, 0.0, -size / 2], processes)
 
 
@@ -233,8 +233,8 @@ def test_a_stokes_image_does_not_claim_constants_that_small_eigenvalues_move(sph
     rng = np.random.default_rng(seed)
     p, variance = noisy(apart(m / m[:, 0, 0].mean(), rng, rng.uniform(0.003, 0.03)), stokes(VERTICAL), seed, 68_000)
     fit = fit_intensities(geometry, p, stokes(VERTICAL), variance)
-    known = [k for k, name in enumerate(NAMES) if fit.identified[name]]
-    assert np.all(np.abs(fit.constants - TRUE)[known] < 3 * fit.stderr[known])
+    identified = [k for k, name in enumerate(NAMES) if fit.identified[name]]
+    assert np.all(np.abs(fit.constants - TRUE)[identified] < 3 * fit.stderr[identified])
 
 
 @pytest.mark.long
@@ -248,13 +248,13 @@ def test_small_eigenvalues_that_differ_do_not_move_the_constants(sphere, electro
         image = noisy_image(apart(m / m[:, 0, 0].mean(), rng), electrons, seed)
         values, rows = determined_values(image)
         data = geometry, values, rows, covariance_by_light(image, rows)
-        fit, other = fit_values(*data), fit_values(*data, correlation=True)
+        fit, correlated = fit_values(*data), fit_values(*data, correlation=True)
         assert fit.describes
         assert all(fit.identified.values())
         pulls.append((fit.constants - TRUE) / fit.stderr)
-        wrong.append((other.constants - TRUE) / fit.stderr)
-        total.append((other.constants - TRUE) / other.stderr)
-        assert electrons == 200 or not other.describes
+        wrong.append((correlated.constants - TRUE) / fit.stderr)
+        total.append((correlated.constants - TRUE) / correlated.stderr)
+        assert electrons == 200 or not correlated.describes
     # Of 12 draws of 4 correlated values: the rms of their pulls is known to 0.17.
     assert 0.55 < np.sqrt(np.mean(np.square(pulls))) < 1.45
     assert np.abs(np.mean(pulls, axis=0)).max() < 1.1

@@ -28,6 +28,6 @@ def test_a_list_of_states_without_a_column_of_an_axis(frames, configs, tmp_path)
         sample=read_sample("unknown"),
     )
     import_capture(request)
-    found = diagnose_captures([request.out], InstrumentModel.load(instrument))[0].diagnosis
-    assert found.error_before.chi2_reduced > 3
-    assert found.error_after.chi2_reduced < 1.1
+    diagnosis = diagnose_captures([request.out], InstrumentModel.load(instrument))[0].diagnosis
+    assert diagnosis.error_before.chi2_reduced > 3
+    assert diagnosis.error_after.chi2_reduced < 1.1

@@ -107,9 +107,9 @@ def test_constants_are_within_their_errors(light):
 def test_one_process_does_not_describe_two_and_says_so():
     points = sphere(3)
     values, covariance = measured(points, np.eye(16), 3, 20_000)
-    one = fit_values(points, values, np.eye(16), covariance)
+    fit = fit_values(points, values, np.eye(16), covariance)
     two = fit_plastic(points, values, np.eye(16), covariance)
-    assert not one.describes
+    assert not fit.describes
     assert two.describes
     assert two.model("tile", 662).constants[662].n == pytest.approx(TRUE[0], abs=4 * two.stderr[0])
 

@@ -108,6 +108,6 @@ def test_the_shadowed_part_of_the_object_is_dark_before_a_bright_background(sphe
 
 
 def test_rows_in_blocks_equal_the_image_at_once(sphere, monkeypatch):
-    whole = sphere.mueller_image(35, 662, 50, 40)
+    image = sphere.mueller_image(35, 662, 50, 40)
     monkeypatch.setattr("simulators.bench.scene.BLOCK_PIXELS", 120)
-    np.testing.assert_array_equal(sphere.mueller_image(35, 662, 50, 40), whole)
+    np.testing.assert_array_equal(sphere.mueller_image(35, 662, 50, 40), image)

@@ -49,8 +49,8 @@ def test_pulls_of_means_have_unit_variance(method, block):
     shared = shared_variance(bins, stderr, correlation)
 
     def means(values: np.ndarray) -> np.ndarray:
-        whole = values[: s1.shape[0] // block[0] * block[0], : s1.shape[1] // block[1] * block[1]]
-        return whole.reshape(-1, block[0], whole.shape[1] // block[1], block[1]).mean(axis=(1, 3))
+        blocks = values[: s1.shape[0] // block[0] * block[0], : s1.shape[1] // block[1] * block[1]]
+        return blocks.reshape(-1, block[0], blocks.shape[1] // block[1], block[1]).mean(axis=(1, 3))
 
     pull = (means(s1) - LIGHT[1]) / np.sqrt(means(shared) / (block[0] * block[1]))
     naive = (means(s1) - LIGHT[1]) / np.sqrt(means(stderr**2) / (block[0] * block[1]))

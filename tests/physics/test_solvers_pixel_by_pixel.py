@@ -34,11 +34,11 @@ def matrix(kind):
     """W (states x channels, 16) of random generators and of analyzers that do or do not see circular light."""
     random = np.random.default_rng(4)
     sent = random.normal(size=(STATES, 3))
-    seen = random.normal(size=(STATES, 3))
+    analyzed = random.normal(size=(STATES, 3))
     if kind == "partial":
-        seen[:, 2] = 0.0
-    sent, seen = (v / np.linalg.norm(v, axis=1)[:, None] for v in (sent, seen))
-    two = np.stack([seen, -seen], axis=1)
+        analyzed[:, 2] = 0.0
+    sent, analyzed = (v / np.linalg.norm(v, axis=1)[:, None] for v in (sent, analyzed))
+    two = np.stack([analyzed, -analyzed], axis=1)
     generator = np.hstack([np.ones((STATES, 1)), sent])
     analyzer = np.concatenate([np.ones((STATES, CHANNELS, 1)), two], axis=2)
     return 0.5 * np.einsum("ncj,nk->ncjk", analyzer, generator).reshape(-1, 16)
@@ -144,9 +144,9 @@ def least_squares(bench, keep):
     return solve
 
 
-@pytest.mark.parametrize("known", [True, False], ids=["noise", "no noise"])
-def test_plain_least_squares(bench, known):
-    found = MuellerSolver(bench.inversion, bench.reader, NOISE if known else None).solve(bench.frames)
+@pytest.mark.parametrize("is_noise_known", [True, False], ids=["noise", "no noise"])
+def test_plain_least_squares(bench, is_noise_known):
+    maps = MuellerSolver(bench.inversion, bench.reader, NOISE if is_noise_known else None).solve(bench.frames)
     signal, scale = bench.signal()
     floor, slope = floor_of(bench)
     for pixel in range(ROWS * COLUMNS):
@@ -156,26 +156,28 @@ def test_plain_least_squares(bench, known):
         solve = least_squares(bench, keep)
         y = signal[:, pixel]
         m = solve @ y
-        left = keep[:, None] * (np.eye(len(y)) - bench.w @ solve) * keep
-        rss = np.sum((left @ y) ** 2)
+        projector = keep[:, None] * (np.eye(len(y)) - bench.w @ solve) * keep
+        rss = np.sum((projector @ y) ** 2)
         free = keep.sum() - bench.inversion.rank
-        if known:
+        if is_noise_known:
             dark = floor * scale[:, pixel] ** 2
             pushes = bench.black_pushes(scale[:, pixel]) * keep[:, None]
             least = solve**2 @ dark + np.sum((solve @ pushes) ** 2, axis=1)
             errors = np.maximum(solve**2 @ (slope * y * scale[:, pixel]) + least, LEAST * least)
-            least_rss = np.diag(left) @ dark + np.sum((left @ pushes) ** 2)
-            expected = max(np.diag(left) @ (slope * y * scale[:, pixel]) + least_rss, LEAST * least_rss)
+            least_rss = np.diag(projector) @ dark + np.sum((projector @ pushes) ** 2)
+            expected = max(np.diag(projector) @ (slope * y * scale[:, pixel]) + least_rss, LEAST * least_rss)
             chi_square = rss / expected
         else:
             errors, chi_square = np.sum(solve**2, axis=1) * rss / free, np.nan
-        seen = np.any(bench.inversion.basis, axis=1)
-        np.testing.assert_allclose(found["mueller"][seen, pixel], m[seen], rtol=2e-4, atol=0.02)
-        np.testing.assert_allclose(found["mueller_errors"][seen, pixel], np.sqrt(errors[seen]), rtol=1e-3)
-        np.testing.assert_allclose(found["mueller"][~seen, pixel], 0.0, atol=1e-3)
-        np.testing.assert_allclose(found["residual_rms"][pixel], np.sqrt(rss / keep.sum()), rtol=1e-3)
-        np.testing.assert_allclose(found["reduced_chi_square"][pixel], chi_square, rtol=2e-3)
-    assert flags(found) == FLAGS
+        is_determined = np.any(bench.inversion.basis, axis=1)
+        np.testing.assert_allclose(maps["mueller"][is_determined, pixel], m[is_determined], rtol=2e-4, atol=0.02)
+        np.testing.assert_allclose(
+            maps["mueller_errors"][is_determined, pixel], np.sqrt(errors[is_determined]), rtol=1e-3
+        )
+        np.testing.assert_allclose(maps["mueller"][~is_determined, pixel], 0.0, atol=1e-3)
+        np.testing.assert_allclose(maps["residual_rms"][pixel], np.sqrt(rss / keep.sum()), rtol=1e-3)
+        np.testing.assert_allclose(maps["reduced_chi_square"][pixel], chi_square, rtol=2e-3)
+    assert flags(maps) == FLAGS
 
 
 FLAGS = {
@@ -189,8 +191,8 @@ FLAGS = {
 }
 
 
-def flags(found):
-    return {int(pixel): Mask(int(found["pixel_flags"][pixel])) for pixel in np.flatnonzero(found["pixel_flags"])}
+def flags(maps):
+    return {int(pixel): Mask(int(maps["pixel_flags"][pixel])) for pixel in np.flatnonzero(maps["pixel_flags"])}
 
 
 @pytest.mark.parametrize(("share", "determined"), [(1 / 900, True), (1 / 1100, False)])
@@ -202,16 +204,16 @@ def test_what_is_left_determines_a_pixel_or_does_not(share, determined, syntheti
     counts[15], counts[16] = 1000 * share, TOP
     with Capture(synthetic_capture(counts.astype(np.uint16), {}, detector={"bits": 12})) as capture:
         reader = BlockReader(capture, np.arange(17), CountCorrection(Black.level(0.0), "test", saturation=TOP))
-        found = MuellerSolver(Inversion.of(w), reader, NOISE).solve(reader.read(slice(0, 1)))
-    assert (flags(found)[0] == Mask.SATURATED) == determined
+        maps = MuellerSolver(Inversion.of(w), reader, NOISE).solve(reader.read(slice(0, 1)))
+    assert (flags(maps)[0] == Mask.SATURATED) == determined
     # As many states as unknowns: nothing is left over.
-    assert np.isnan(found["reduced_chi_square"][0])
-    np.testing.assert_allclose(found["mueller"][:15, 0], 1000.0, rtol=1e-5)
+    assert np.isnan(maps["reduced_chi_square"][0])
+    np.testing.assert_allclose(maps["mueller"][:15, 0], 1000.0, rtol=1e-5)
 
 
 def test_noise_weighted_least_squares(bench):
     solver = WeightedSolver(MuellerSolver(bench.inversion, bench.reader, NOISE), covariance=True)
-    found = solver.solve(bench.frames)
+    maps = solver.solve(bench.frames)
     signal, scale = bench.signal()
     floor, slope = floor_of(bench)
     basis = bench.inversion.basis
@@ -223,25 +225,25 @@ def test_noise_weighted_least_squares(bench):
         fitted = bench.w @ (least_squares(bench, keep) @ y)
         variance = np.maximum(slope * fitted * scale[:, pixel] + least, LEAST * least)
         root = keep / np.sqrt(variance)
-        seen = root[:, None] * (bench.w @ basis)
-        solve = basis @ np.linalg.pinv(seen)
+        weighted_w = root[:, None] * (bench.w @ basis)
+        solve = basis @ np.linalg.pinv(weighted_w)
         m = solve @ (root * y)
         chi_square = np.sum((root * (y - bench.w @ m)) ** 2)
         pushes = bench.black_pushes(scale[:, pixel]) * root[:, None]
         covariance = solve @ solve.T + (solve @ pushes) @ (solve @ pushes).T
-        left = pushes - root[:, None] * (bench.w @ (solve @ pushes))
-        expected = keep.sum() - basis.shape[1] + np.sum(left * pushes)
+        push_residual = pushes - root[:, None] * (bench.w @ (solve @ pushes))
+        expected = keep.sum() - basis.shape[1] + np.sum(push_residual * pushes)
         residual = keep * (y - bench.w @ m)
-        np.testing.assert_allclose(found["mueller"][:, pixel], m, rtol=2e-4, atol=0.02)
+        np.testing.assert_allclose(maps["mueller"][:, pixel], m, rtol=2e-4, atol=0.02)
         size = np.sqrt(np.diag(covariance))
-        np.testing.assert_allclose(found["mueller_errors"][:, pixel], size, rtol=1e-3, atol=1e-6)
-        packed = found["mueller_covariance"][:, pixel]
+        np.testing.assert_allclose(maps["mueller_errors"][:, pixel], size, rtol=1e-3, atol=1e-6)
+        packed = maps["mueller_covariance"][:, pixel]
         atol = 1e-3 * size.max() ** 2
         np.testing.assert_allclose(packed, covariance[PACKED_ROW, PACKED_COLUMN], atol=atol)
-        np.testing.assert_allclose(found["reduced_chi_square"][pixel], chi_square / expected, rtol=2e-3)
-        np.testing.assert_allclose(found["residual_rms"][pixel], np.sqrt(np.sum(residual**2) / keep.sum()), rtol=1e-3)
-    assert flags(found) == FLAGS
-    assert np.isnan(found["mueller_errors"][0, LOST])
+        np.testing.assert_allclose(maps["reduced_chi_square"][pixel], chi_square / expected, rtol=2e-3)
+        np.testing.assert_allclose(maps["residual_rms"][pixel], np.sqrt(np.sum(residual**2) / keep.sum()), rtol=1e-3)
+    assert flags(maps) == FLAGS
+    assert np.isnan(maps["mueller_errors"][0, LOST])
 
 
 def test_weights_need_the_noise(bench):

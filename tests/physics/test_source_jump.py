@@ -21,12 +21,12 @@ def test_a_jump_between_two_runs_is_found_and_none_where_there_is_none(configs, 
     with Capture(path) as capture:
         resumed = (np.arange(len(capture.done)) >= len(capture.done) - STATES + RESUMED).astype(np.int64)
     monkeypatch.setattr(Capture, "run_of_states", resumed)
-    found = diagnose_captures([path], InstrumentModel.load(file))[0].diagnosis
+    diagnosis = diagnose_captures([path], InstrumentModel.load(file))[0].diagnosis
     if fraction:
-        assert found.verdict == "explained"
-        assert [e.kind for e in found.effects if e.confident] == ["source_jump"]
-        told = found.effects[0].parameters["run_2"]
-        assert told.value == pytest.approx(fraction, abs=4 * told.stderr)
-        assert told.stderr < 0.002
+        assert diagnosis.verdict == "explained"
+        assert [e.kind for e in diagnosis.effects if e.confident] == ["source_jump"]
+        jump = diagnosis.effects[0].parameters["run_2"]
+        assert jump.value == pytest.approx(fraction, abs=4 * jump.stderr)
+        assert jump.stderr < 0.002
     else:
-        assert not found.effects
+        assert not diagnosis.effects

@@ -69,8 +69,8 @@ def flicker(states=46, seed=5):
 def test_a_factor_of_each_state_does_not_change_m(name, weighted, measured):
     states = len(next(iter(ANGLES[name].values())))
     steady, _, _ = measured(name, HALF_WAVE, noise=1e-6, weighted=weighted)
-    found, _, facts = measured(name, HALF_WAVE, flicker(states), noise=1e-6, weighted=weighted)
-    assert found == pytest.approx(steady, abs=3e-5, nan_ok=True)
+    m, _, facts = measured(name, HALF_WAVE, flicker(states), noise=1e-6, weighted=weighted)
+    assert m == pytest.approx(steady, abs=3e-5, nan_ok=True)
     assert "projected out" in facts["source"]
 
 
@@ -78,10 +78,10 @@ def test_the_product_holds_the_levels(measured, tmp_path):
     level = flicker()
     measured("drr_wollaston", HALF_WAVE, level)
     with h5py.File(tmp_path / "m.h5") as h5:
-        found = {}
-        h5.visititems(lambda name, node: found.__setitem__(name.rpartition("/")[2], node))
-        told, error = found["source_level"][...], found["source_level_errors"][...]
-    pulls = (told - level / level.mean()) / error
+        nodes = {}
+        h5.visititems(lambda name, node: nodes.__setitem__(name.rpartition("/")[2], node))
+        levels, error = nodes["source_level"][...], nodes["source_level_errors"][...]
+    pulls = (levels - level / level.mean()) / error
     assert np.sqrt(np.mean(pulls**2)) == pytest.approx(1, abs=0.35)
 
 
@@ -90,8 +90,8 @@ def test_the_product_holds_the_levels(measured, tmp_path):
 def test_the_error_bars_have_the_levels_in_them(sample, pixels, measured):
     pulls = []
     for seed in range(12):
-        found, error, _ = measured("drr_wollaston", sample, flicker(seed=seed), pixels=pixels, seed=seed)
-        pulls.append(((found[..., 0, :] - sample[..., None]) / error[..., 0, :]).reshape(16, -1)[1:, 0])
+        m, error, _ = measured("drr_wollaston", sample, flicker(seed=seed), pixels=pixels, seed=seed)
+        pulls.append(((m[..., 0, :] - sample[..., None]) / error[..., 0, :]).reshape(16, -1)[1:, 0])
     assert np.sqrt(np.mean(np.square(pulls))) == pytest.approx(1, abs=0.25)
 
 

@@ -35,11 +35,11 @@ def test_mean_variance_and_count_equal_a_loop_over_pixels(layout, quantities):
     half = 1500  # two captures
     table.add(Angles(*(a[:half] for a in angles)), values[:, :half])
     table.add(Angles(*(a[half:] for a in angles)), values[:, half:])
-    wanted = reference(table.axes, angles, values)
-    assert len(wanted) == table.bins.size
+    expected = reference(table.axes, angles, values)
+    assert len(expected) == table.bins.size
     for row, b in enumerate(table.bins):
         key = tuple(int(k) for k in np.unravel_index(b, SHAPE))
-        samples = wanted[key]
+        samples = expected[key]
         assert table.count[row] == len(samples)
         np.testing.assert_allclose(table.mean[:, row], samples.mean(axis=0), rtol=1e-6)
         if len(samples) > 1:
@@ -81,18 +81,18 @@ def test_file_round_trip_keeps_growing_and_merging(tmp_path):
     a, b = random_angles(400, 1), random_angles(400, 2)
     va, vb = np.random.default_rng(3).uniform(size=(2, 4, 400))
     kind = {"has_noise": True, "inputs": ("polarizer", "analyzer")}
-    whole, part, other = (ScatteringTable(("xi0",), 451, "renderer", True, **kind) for _ in range(3))
-    whole.add(a, va)
-    whole.add(b, vb)
+    table, part, second = (ScatteringTable(("xi0",), 451, "renderer", True, **kind) for _ in range(3))
+    table.add(a, va)
+    table.add(b, vb)
     part.add(a, va)
-    other.add(b, vb)
+    second.add(b, vb)
     part.save(tmp_path / "t.h5")
     loaded = ScatteringTable.load(tmp_path / "t.h5")
-    loaded.merge(other)
+    loaded.merge(second)
     assert (loaded.wavelength_nm, loaded.axes.layout, loaded.simulated) == (451, "renderer", True)
     probe = random_angles(500, 4)
-    np.testing.assert_allclose(loaded.lookup(probe), whole.lookup(probe))
-    for name, values in whole.uncertainties.items():
+    np.testing.assert_allclose(loaded.lookup(probe), table.lookup(probe))
+    for name, values in table.uncertainties.items():
         np.testing.assert_allclose(loaded.uncertainties[name], values)
     with h5py.File(tmp_path / "t.h5") as h5:
         np.testing.assert_allclose(h5["entry/sums/theta_h_deg"][...], 90 * (np.arange(91) / 90) ** 2)
@@ -115,8 +115,8 @@ def test_a_table_of_an_earlier_version_is_read(tmp_path, version):
             del h5["entry"]
     loaded = ScatteringTable.load(tmp_path / "t.h5")
     assert (loaded.quantities, loaded.inputs) == (("xi0",), ("analyzer",))
-    for one, other in ((loaded.mean, table.mean), (loaded.variance, table.variance)):
-        np.testing.assert_array_equal(one, other)
+    for array, expected in ((loaded.mean, table.mean), (loaded.variance, table.variance)):
+        np.testing.assert_array_equal(array, expected)
     for name in ("u_noise", "u_systematic"):
         np.testing.assert_array_equal(loaded.uncertainties[name], table.uncertainties[name])
     assert [step.name for step in table_steps(tmp_path / "t.h5")] == ["table"]

@@ -95,8 +95,8 @@ def test_export_and_import_give_the_filled_bins_back(tmp_path):
 
 
 def test_empty_bins_take_the_nearest_value_around_the_circle():
-    one = np.deg2rad([[10.0, 20.0, 179.0], [10.0, 20.0, 0.0]]).T
-    table = mueller_table(Angles(*one), np.stack([np.full(16, 1.0), np.full(16, 2.0)], axis=-1))
+    angles = np.deg2rad([[10.0, 20.0, 179.0], [10.0, 20.0, 0.0]]).T
+    table = mueller_table(Angles(*angles), np.stack([np.full(16, 1.0), np.full(16, 2.0)], axis=-1))
     dense, gaps = pbsdf.fill_bins(table, table.mean, 1.0, "nearest")
     _, cos_i, _ = pbsdf.bin_centres()
     i, j = round(90 * np.sqrt(10 / 90)), 20
@@ -109,15 +109,15 @@ def test_empty_bins_take_the_nearest_value_around_the_circle():
 
 def test_the_uncertainty_of_each_element_is_exported_where_there_are_samples(tmp_path):
     table = ScatteringTable(pbsdf.MUELLER, 662, "renderer", frames="renderer", has_noise=True, inputs=("analyzer",))
-    one = Angles(np.array([0.0]), np.array([0.0]), np.array([0.0]))
-    table.add(one, np.repeat([1.0, 0.03**2, 0.04], 16)[:, None])
+    direction = Angles(np.array([0.0]), np.array([0.0]), np.array([0.0]))
+    table.add(direction, np.repeat([1.0, 0.03**2, 0.04], 16)[:, None])
     pbsdf.export([table], tmp_path / "m.pbsdf", white_m00=2.0, uncertainty=True, pad_wavelengths=False)
     fields = read_tensor_file(tmp_path / "m.pbsdf")
     assert fields["u"][180, 0, 0, 0] * 2 * np.pi == pytest.approx(np.full((4, 4), 0.05))
     assert np.isfinite(fields["u"]).sum() == 16
     assert np.isfinite(fields["M"]).sum() > 1e6
     with pytest.raises(TableError, match="does not know its noise"):
-        pbsdf.export([mueller_table(one, np.ones((16, 1)))], tmp_path / "n.pbsdf", uncertainty=True)
+        pbsdf.export([mueller_table(direction, np.ones((16, 1)))], tmp_path / "n.pbsdf", uncertainty=True)
 
 
 def test_only_what_the_renderer_expects_is_exported(tmp_path):

@@ -16,8 +16,8 @@ from simulators.bench.traced_surface import TracedSurface, trace_surface
 def test_the_paper_s_model_is_what_the_fields_do(configs: Path, omega_deg, wavelength_nm):
     scene = Scene.load(configs / "scenes/red_sphere.yaml")
     points = scene.object.geometry.at(omega_deg, 61, 61).points
-    found = trace_surface(scene.material).mueller_jones(points, wavelength_nm)
-    assert np.abs(found - scene.material.mueller_jones(points, wavelength_nm)).max() < 1e-12
+    matrices = trace_surface(scene.material).mueller_jones(points, wavelength_nm)
+    assert np.abs(matrices - scene.material.mueller_jones(points, wavelength_nm)).max() < 1e-12
     jones = trace_surface(scene.material).jones(points, wavelength_nm)
     assert np.abs(jones - scene.material.jones(points, wavelength_nm)).max() < 1e-12
 

@@ -16,8 +16,8 @@ STATES = 40
 
 def effect(kind, element=None, capture=None, wavelength_nm=None, **values):
     parameters = {name: EffectParameter(value=value, unit="") for name, value in values.items()}
-    own = {"captures": (capture,), "scope": "capture"} if capture else {}
-    return AppliedEffect(kind=kind, element=element, parameters=parameters, wavelength_nm=wavelength_nm, **own)
+    place = {"captures": (capture,), "scope": "capture"} if capture else {}
+    return AppliedEffect(kind=kind, element=element, parameters=parameters, wavelength_nm=wavelength_nm, **place)
 
 
 @pytest.fixture
@@ -59,11 +59,11 @@ SAMPLES = st.lists(st.text(LETTERS, min_size=1, max_size=50), min_size=1, max_si
 def test_any_file_name_of_a_capture_is_read_as_it_was(sample, omega, values):
     """`acquire` names a file by time, sample, mode, wavelength and angle; a user may call it anything."""
     name = f"20261124-082522_{sample}_drr_662nm_omega{omega}"
-    one = InstrumentModel.load(ROOT / "configs/instruments/rgb950.yaml")
+    base = InstrumentModel.load(ROOT / "configs/instruments/rgb950.yaml")
     flicker = effect("source_flicker", None, name, states=tuple(values))
-    both = uncertain(one, (flicker, effect("rotation_slip", "psa@14", sample, slip=0.3)))
-    both = both.model_copy(update={"effects": (flicker,)})
-    assert parse_yaml(dump_yaml(both), InstrumentModel) == both
+    document = uncertain(base, (flicker, effect("rotation_slip", "psa@14", sample, slip=0.3)))
+    document = document.model_copy(update={"effects": (flicker,)})
+    assert parse_yaml(dump_yaml(document), InstrumentModel) == document
 
 
 def test_a_capture_that_an_earlier_version_named_is_found(model):
@@ -86,21 +86,21 @@ def test_those_of_three_captures_leave_room_for_another_wavelength(model):
     each = tuple(effect(*kind, name, states=(0.1,) * STATES) for kind in kinds for name in captures)
     few = tuple(effect("rotation_eccentricity", "psa", cos_1=0.1, sin_1=0.2, cos_2=0.3, sin_2=0.4) for _ in range(1))
     error = uncertain(model, *[(*each, *few)] * 20).systematic[0]
-    both = model.model_copy(update={"systematic": (error, error.model_copy(update={"wavelength_nm": 451.0}))})
-    assert parse_yaml(dump_yaml(both), InstrumentModel) == both
+    document = model.model_copy(update={"systematic": (error, error.model_copy(update={"wavelength_nm": 451.0}))})
+    assert parse_yaml(dump_yaml(document), InstrumentModel) == document
 
 
 @pytest.mark.parametrize(
-    ("label", "values", "told"),
+    ("label", "values", "message"),
     [
         ("[psa]", "{fraction: 0.1}", "is not KIND[ELEMENT]"),
         ("source_flicker", "{states: 0.1 fast}", "fast"),
         ("source_flicker", "{states: 0.1 nan}", "finite"),
     ],
 )
-def test_a_slip_in_a_direction_is_told(model, label, values, told):
+def test_a_slip_in_a_direction_is_told(model, label, values, message):
     head = dump_yaml(model).replace("systematic: []\n", "")
     text = f"{head}systematic:\n  - rms_over_m00: 0.1\n    directions:\n      - '{label}': {values}\n"
     with pytest.raises(ConfigError) as refused:
         parse_yaml(text, InstrumentModel)
-    assert told in str(refused.value)
+    assert message in str(refused.value)

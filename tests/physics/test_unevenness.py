@@ -24,8 +24,8 @@ def test_a_source_whose_size_is_told_too_small_is_as_even_as_one_that_is_told_ri
     bench = TrueBench(rows=40, columns=40)
     bench.level.append(lambda k, a: 1 + 0.05 * k / (STATES - 1))
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").nominal_at(662)
-    with Capture(bench_capture(tmp_path, configs / "instruments/rgb950.yaml", bench, air=True)) as taken:
-        problem = InstrumentProblem(model, [read_capture(taken, model)])
+    with Capture(bench_capture(tmp_path, configs / "instruments/rgb950.yaml", bench, air=True)) as capture:
+        problem = InstrumentProblem(model, [read_capture(capture, model)])
     drift = next(c for c in problem.pool() if c.kind == "source_drift")
     for size in (0.05, 0.02):
         excess, terms = Evenness(problem, Space((drift,)), np.array([size, 0.0])).varies(drift)
@@ -40,8 +40,8 @@ def test_where_the_image_moves_a_source_is_as_even(configs, tmp_path):
     file = configs / "instruments/rgb950.yaml"
     path = bench_capture(tmp_path, file, bench, seed=8, scene=RoundSample)
     model = InstrumentModel.load(file).nominal_at(662)
-    with Capture(path) as taken:
-        problem = InstrumentProblem(model, [without_steep_pixels(read_capture(taken, model))])
+    with Capture(path) as capture:
+        problem = InstrumentProblem(model, [without_steep_pixels(read_capture(capture, model))])
     space = Space(tuple(c for c in problem.pool() if c.kind in ("source_drift", "image_drift")))
     fit = minimize(problem, space, np.zeros(space.size))
     drift = next(c for c in space.candidates if c.kind == "source_drift")
@@ -57,8 +57,8 @@ def test_a_drift_is_even_over_the_image_and_an_image_that_turns_is_not(configs, 
         bench.light.append(lambda k, e: rotate(e, 0.3 * k / (STATES - 1), reshape=False, order=3, mode="nearest"))
     file = configs / "instruments/rgb950.yaml"
     model = InstrumentModel.load(file).nominal_at(662)
-    with Capture(bench_capture(tmp_path, file, bench, seed=8, scene=RoundSample)) as taken:
-        problem = InstrumentProblem(model, [without_steep_pixels(read_capture(taken, model))])
+    with Capture(bench_capture(tmp_path, file, bench, seed=8, scene=RoundSample)) as capture:
+        problem = InstrumentProblem(model, [without_steep_pixels(read_capture(capture, model))])
     space = Space(tuple(c for c in problem.pool() if c.kind == "image_drift"))
     fit = minimize(problem, space, np.zeros(space.size))
     excess, terms = Evenness(problem, space, fit.values).varies(space.candidates[0])

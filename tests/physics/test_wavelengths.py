@@ -70,11 +70,11 @@ def test_mounts_are_shared_and_optics_are_not(problem):
 
 def test_a_train_far_off_is_found_wavelength_by_wavelength(problem):
     base = Space(problem.nominal())
-    found = along_wavelengths(problem, base, lambda line: None)
-    values = np.concatenate([found[c] for c in base.candidates])
+    start = along_wavelengths(problem, base, lambda line: None)
+    values = np.concatenate([start[c] for c in base.candidates])
     assert minimize(problem, base, values).rms < 1e-4
     # A plate seen from its slow axis, or half a turn on, is the same plate.
-    at = {(c.place, c.wavelength_nm): float(found[c][0]) for c in base.candidates}
+    at = {(c.place, c.wavelength_nm): float(start[c][0]) for c in base.candidates}
     for wavelength, truth in RETARDANCES.items():
         for name in AZIMUTHS:
             fitted = 90 + at[f"{name}.retardance_deg", wavelength]
@@ -95,17 +95,17 @@ def test_gradient_of_shared_and_own_values(problem):
 
 def test_a_free_source_leaves_no_residual():
     gain = np.random.default_rng(3).uniform(0.5, 1.5, ANGLES["psg"].size)
-    left = {}
+    residuals = {}
     for free in (False, True):
         model = train(free)
         values = {n: {"azimuth_deg": a, "retardance_deg": RETARDANCES[600.0]} for n, a in AZIMUTHS.items()}
         problem = InstrumentProblem(model.with_values(values).at(600.0), [captured(model, 600.0, gain)], folds=1)
         sums = problem.sums(Space(()), np.zeros(0), derivatives=False)
-        left[free] = float(np.sqrt(sums.square.sum() / sums.count.sum()))
+        residuals[free] = float(np.sqrt(sums.square.sum() / sums.count.sum()))
         # One value of two is left over in each state.
         assert sums.count.sum() == pytest.approx(gain.size if free else 2 * gain.size - 1)
-    assert left[True] < 1e-5
-    assert left[False] > 0.1
+    assert residuals[True] < 1e-5
+    assert residuals[False] > 0.1
     # What changes both channels of a state alike is taken up too.
     assert not any(c.kind.startswith("source") or c.kind.endswith("transmission") for c in problem.pool())
 
@@ -114,13 +114,13 @@ def test_what_the_intensities_do_not_tell_of_m_is_no_error_of_the_instrument(pro
     space = Space(tuple(c for c in problem.pool() if c.kind == "rotation_eccentricity"))
     values = np.zeros(space.size)
 
-    def of_all(left=None):
-        return sum(products.sum(axis=0) for _, products in mueller_slopes(problem, space, values, left))
+    def of_all(remainder=None):
+        return sum(products.sum(axis=0) for _, products in mueller_slopes(problem, space, values, remainder))
 
-    told, half, nothing = (of_all(np.full(3, x)) for x in (1.0, 1e3, 1e9))
-    assert told == pytest.approx(of_all())
-    assert np.trace(nothing) < 1e-6 * np.trace(told)
-    assert 0.01 < np.trace(half) / np.trace(told) < 0.99
+    full, half, nothing = (of_all(np.full(3, x)) for x in (1.0, 1e3, 1e9))
+    assert full == pytest.approx(of_all())
+    assert np.trace(nothing) < 1e-6 * np.trace(full)
+    assert 0.01 < np.trace(half) / np.trace(full) < 0.99
 
 
 def one_run(wavelengths) -> InstrumentProblem:
@@ -136,8 +136,8 @@ def test_angles_that_wavelengths_share_are_told_by_all_of_their_ratios(wavelengt
     angles = tuple(c for c in problem.pool() if c.kind == "angle_per_state")
     assert len(angles) == 1
     bench = WholeBench(problem, lambda line: None)
-    found = SimpleNamespace(space=Space(angles), members=((0,),), samples=SimpleNamespace(probability=np.ones(1)))
-    assert bench.as_many_as_intensities(found, 0.5) == (set(angles) if doubted else set())
+    posterior = SimpleNamespace(space=Space(angles), members=((0,),), samples=SimpleNamespace(probability=np.ones(1)))
+    assert bench.as_many_as_intensities(posterior, 0.5) == (set(angles) if doubted else set())
 
 
 def test_what_shared_angles_take_away_is_taken_from_every_capture():
@@ -145,9 +145,9 @@ def test_what_shared_angles_take_away_is_taken_from_every_capture():
     space = Space(tuple(c for c in problem.pool() if c.kind == "angle_per_state"))
     values = np.zeros(space.size)
     sums = problem.sums(space, values)
-    found = held_out(problem, space, Fit(values, sums, float(sums.excess.sum())))
-    assert found.count < sums.count.sum() - 0.9 * space.size
-    assert found.shares[:, 1].sum() == pytest.approx(found.count)
+    check = held_out(problem, space, Fit(values, sums, float(sums.excess.sum())))
+    assert check.count < sums.count.sum() - 0.9 * space.size
+    assert check.shares[:, 1].sum() == pytest.approx(check.count)
 
 
 def test_sets_are_weighed_beside_far_steeper_directions():
@@ -161,9 +161,9 @@ def test_sets_are_weighed_beside_far_steeper_directions():
 
 
 def test_a_free_source_needs_two_channels():
-    one = train().model_dump() | {"channels": [{"name": "camera"}], "free_source": True}
+    declared = train().model_dump() | {"channels": [{"name": "camera"}], "free_source": True}
     with pytest.raises(ValueError, match="two channels"):
-        InstrumentModel.model_validate(one)
+        InstrumentModel.model_validate(declared)
 
 
 def diagnosis(values: dict[str, EffectParameter], effects: tuple[AppliedEffect, ...]) -> Diagnosis:

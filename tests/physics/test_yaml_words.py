@@ -86,7 +86,7 @@ def test_a_file_of_another_kind_is_told_by_that_alone():
 
 
 @pytest.mark.parametrize(
-    ("line", "told"),
+    ("line", "message"),
     [
         ("turned_deg: {start_deg: 0, step_deg: 0}", "turned_deg.step_deg: must be more than 0.0, not 0"),
         ("turned_deg: {start_deg: 0}", "turned_deg.step_deg: is missing"),
@@ -98,13 +98,13 @@ def test_a_file_of_another_kind_is_told_by_that_alone():
         ("legs: 4", "legs: unknown key; another section may have it"),
     ],
 )
-def test_words_of_one_mistake(line, told):
+def test_words_of_one_mistake(line, message):
     good = {"address": "a", "area_m2": 1, "heated": "true", "colour": "red", "pets": "[]"}
     key = line.split(":")[0]
     text = line + "\n" + "".join(f"{name}: {value}\n" for name, value in good.items() if name != key)
     with pytest.raises(ConfigError) as error:
         parse_yaml(text, House, "x.yaml")
-    assert f"x.yaml:1: {told}" in str(error.value).splitlines()
+    assert f"x.yaml:1: {message}" in str(error.value).splitlines()
 
 
 def test_a_tab_is_called_a_tab():
