@@ -16,14 +16,17 @@ from tests.protocol.scripted import scripted
 
 
 def test_gsc_moves_are_relative_and_asked_for() -> None:
-    rest, taken = (b"Q:\r\n", b"-      400,       20,K,K,R\r\n"), (b"Q:\r\n", b"OK\r\n-      400,       20,K,K,B\r\n")
+    idle, accepted = (
+        (b"Q:\r\n", b"-      400,       20,K,K,R\r\n"),
+        (b"Q:\r\n", b"OK\r\n-      400,       20,K,K,B\r\n"),
+    )
     with (
         scripted(
             (b"?:V\r\n", b"V1.10\r\n"),
-            rest,
-            *[rest] * 8,
+            idle,
+            *[idle] * 8,
             (b"M:1+P1200\r\n", b""),
-            taken,
+            accepted,
             (b"G:\r\n", b""),
             (b"Q:\r\n", b"-      400,       20,X,L,R\r\n"),
             (b"L:1\r\n", b""),
@@ -41,9 +44,9 @@ def test_gsc_moves_are_relative_and_asked_for() -> None:
 
 def test_a_gsc_02_is_driven_by_a_letter_without_a_colon() -> None:
     # Blanks as the manuals print them.
-    rest = (b"Q:\r\n", b"-       400,         0, K, K, R\r\n")
+    idle = (b"Q:\r\n", b"-       400,         0, K, K, R\r\n")
     with (
-        scripted((b"?:V\r\n", b"V2.00\r\n"), *[rest] * 3, (b"M:1+P1200\r\n", b""), rest, (b"G\r\n", b""), rest) as path,
+        scripted((b"?:V\r\n", b"V2.00\r\n"), *[idle] * 3, (b"M:1+P1200\r\n", b""), idle, (b"G\r\n", b""), idle) as path,
         LineRegistry(clock=patient_clock()) as lines,
     ):
         axis = gsc.open("psg", gsc.Config(port=path, home_direction="-", assume_homed=True, rtscts=False), lines)
@@ -265,7 +268,7 @@ def test_framers_take_any_bytes_and_keep_little(pieces: list[bytes]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "told"),
+    ("answer", "identity"),
     [
         # The first is what public recordings of an E-861 have.
         ("(c)2013 Physik Instrumente(PI) Karlsruhe, E-861 Version 7.2.0", ("E-861", "", "7.2.0")),
@@ -274,8 +277,8 @@ def test_framers_take_any_bytes_and_keep_little(pieces: list[bytes]) -> None:
         ("(c)2015 Physik Instrumente (PI) GmbH", ("", "", "")),
     ],
 )
-def test_what_a_pi_controller_says_of_itself(said: str, told: tuple[str, str, str]) -> None:
-    assert gcs2.read_identity(said)[1:] == told
+def test_what_a_pi_controller_says_of_itself(answer: str, identity: tuple[str, str, str]) -> None:
+    assert gcs2.read_identity(answer)[1:] == identity
 
 
 def test_errors_of_one_esp301_axis_are_kept_while_another_is_asked() -> None:

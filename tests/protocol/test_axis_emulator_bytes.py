@@ -368,8 +368,8 @@ QUESTIONS = {
 
 @pytest.mark.parametrize("kind", QUESTIONS)
 def test_input_in_single_bytes_gives_the_same_answers(kind: str) -> None:
-    whole, _ = emulator(kind)
+    lines, _ = emulator(kind)
     pieces, _ = emulator(kind)
     for byte in QUESTIONS[kind]:
         pieces.receive(bytes([byte]))
-    assert pieces.take_output() == talk(whole, QUESTIONS[kind]) != b""
+    assert pieces.take_output() == talk(lines, QUESTIONS[kind]) != b""

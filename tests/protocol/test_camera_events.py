@@ -86,9 +86,9 @@ def test_the_end_of_each_exposure_is_told_with_its_frame(listener: Listener) -> 
     assert listener.event(timeout_s=0.1) is None
     listener.open_channel()
     frames = listener.camera.capture(2)
-    told = [listener.event() for _ in frames]
-    assert [event[:2] for event in told if event] == [(EXPOSURE_END, frame.frame_id) for frame in frames]
-    for event, frame in zip(told, frames, strict=True):
+    events = [listener.event() for _ in frames]
+    assert [event[:2] for event in events if event] == [(EXPOSURE_END, frame.frame_id) for frame in frames]
+    for event, frame in zip(events, frames, strict=True):
         assert event is not None
         # The chunk behind the image has the start of the exposure.
         assert event[2] > frame.camera_time_ns

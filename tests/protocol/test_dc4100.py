@@ -65,8 +65,8 @@ def test_each_call_sends_these_lines_and_no_others(action, pairs) -> None:  # ty
 def test_a_refusal_is_explained_by_status_and_error() -> None:
     # Status 0xA88: too hot.
     pairs = [*OFF, ("O 0 1", ""), *OFF, *[("R?", "2696")] * 2, ("E?", "ERROR 4:over temperature")]
-    told = pytest.raises(CommandRejected, match=r"LED 1 on: .*too hot.*error 4 over temperature")
-    with scripted(*wire(pairs)) as path, LineRegistry(clock=patient_clock()) as lines, told:
+    refusal = pytest.raises(CommandRejected, match=r"LED 1 on: .*too hot.*error 4 over temperature")
+    with scripted(*wire(pairs)) as path, LineRegistry(clock=patient_clock()) as lines, refusal:
         opened(path, lines).set_light(True)
 
 

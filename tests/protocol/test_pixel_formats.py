@@ -53,11 +53,11 @@ def test_an_image_survives_the_wire(fmt: PixelFormat, width: int, height: int, s
 def test_codes_are_those_that_aravis_has() -> None:
     aravis, _ = load_aravis()
     names = [name for name in dir(aravis) if name.startswith("PIXEL_FORMAT_")]
-    told = {name.replace("_", ""): int(getattr(aravis, name)) & 0xFFFFFFFF for name in names}
-    theirs = {fmt.name: told.get(f"PIXELFORMAT{fmt.name.upper()}") for fmt in PIXEL_FORMATS}
-    known = {name: code for name, code in theirs.items() if code is not None}
-    assert {"Mono14", "BayerGR8", "BayerGB12p", "BayerBG10", "BayerBG16"} <= known.keys()
-    assert known == {fmt.name: fmt.code for fmt in PIXEL_FORMATS if fmt.name in known}
+    codes = {name.replace("_", ""): int(getattr(aravis, name)) & 0xFFFFFFFF for name in names}
+    theirs = {fmt.name: codes.get(f"PIXELFORMAT{fmt.name.upper()}") for fmt in PIXEL_FORMATS}
+    named_codes = {name: code for name, code in theirs.items() if code is not None}
+    assert {"Mono14", "BayerGR8", "BayerGB12p", "BayerBG10", "BayerBG16"} <= named_codes.keys()
+    assert named_codes == {fmt.name: fmt.code for fmt in PIXEL_FORMATS if fmt.name in named_codes}
 
 
 def test_bits_in_memory_are_in_the_code() -> None:
