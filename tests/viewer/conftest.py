@@ -75,9 +75,9 @@ def address(lab: Path) -> Iterator[str]:
     )
     assert child.stdout is not None
     line = child.stdout.readline()
-    found = re.search(r"http://127\.0\.0\.1:\d+/\S+/", line)
-    assert found, line
-    yield found[0].rstrip("/")
+    match = re.search(r"http://127\.0\.0\.1:\d+/\S+/", line)
+    assert match, line
+    yield match[0].rstrip("/")
     child.send_signal(signal.SIGINT)
     child.wait()
     child.stdout.close()

@@ -34,15 +34,15 @@ def pages(lab, drr_capture, client, campaign, diagnosed, monkeypatch, tmp_path):
     """Address of each page of a folder with captures, products, a campaign, regions, notes, a job and an alarm."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     alarms.give_alarm("bench", "acquire died. THE LIGHT IS NOT SHUT: no answer")
-    one, two = drr_capture("one.h5", omega_deg=35.0), drr_capture("two.h5", seed_of_noise=2)
-    products = [Reduction(one).make(), Reduction(two).make()]
+    first, second = drr_capture("one.h5", omega_deg=35.0), drr_capture("two.h5", seed_of_noise=2)
+    products = [Reduction(first).make(), Reduction(second).make()]
     Quantities(products[0]).make()
     (lab / "damaged.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
-    here = {"origin": "http://127.0.0.1:8000"}
+    origin = {"origin": "http://127.0.0.1:8000"}
     place = {"x0": "2", "x1": "9", "y0": "3", "y1": "8"}
     for name in ("spot", "edge"):
-        assert client.post("/keep-region", json={"file": "one.h5", "name": name} | place, headers=here).is_success
-    assert client.post("/note", json={"file": "one.h5", "text": "cold", "tags": "a, b"}, headers=here).is_success
+        assert client.post("/keep-region", json={"file": "one.h5", "name": name} | place, headers=origin).is_success
+    assert client.post("/note", json={"file": "one.h5", "text": "cold", "tags": "a, b"}, headers=origin).is_success
     job = Jobs(lab).start("long output", ["process", "--help"], {}, lab)
     return {
         "library": "/?captures_group=sample",
@@ -68,14 +68,14 @@ def diagnosed(lab, drr_capture, configs, run_main):
     (lab / "off.yaml").write_text(text.replace("662: 127.12", "662: 128.9"))
     name, folder = Diagnoses(Library(lab)).begin([capture], lab / "off.yaml")
     outputs = ("--json", folder / "diagnosis.json", "--report", folder / "report.html")
-    given = ("--instrument", folder / "instrument.yaml", "--residuals", folder / "residuals.npz")
-    assert run_main(diagnose, capture, *given, *outputs)[0] == 0
+    options = ("--instrument", folder / "instrument.yaml", "--residuals", folder / "residuals.npz")
+    assert run_main(diagnose, capture, *options, *outputs)[0] == 0
     return name
 
 
 def findings(page):
-    found = Axe().run(page, options=RULES).response["violations"]
-    return [(one["id"], [node["html"][:150] for node in one["nodes"]]) for one in found]
+    violations = Axe().run(page, options=RULES).response["violations"]
+    return [(violation["id"], [node["html"][:150] for node in violation["nodes"]]) for violation in violations]
 
 
 @pytest.mark.long
@@ -91,8 +91,8 @@ def test_no_page_has_a_finding_and_none_is_wider_than_its_window(pages, address,
                 page.locator("#region-histogram .plot-container").wait_for()
                 page.locator("#probe:not([hidden])").wait_for()
             page.wait_for_timeout(300)
-            if found := findings(page):
-                wrong[name, width] = found
+            if violations := findings(page):
+                wrong[name, width] = violations
             assert page.evaluate("document.documentElement.scrollWidth") <= width, (name, width)
         page.close()
     assert wrong == {}, wrong

@@ -28,12 +28,12 @@ def test_an_alarm_is_on_every_page_until_its_button_is_pressed(client: TestClien
 
 @pytest.mark.parametrize("name", ["../other.json", "other.json", "", "/etc/passwd"])
 def test_nothing_but_an_alarm_is_acknowledged(client: TestClient, alarm, name, tmp_path):
-    other = tmp_path / "umov" / "other.json"
-    other.write_text("{}")
+    unrelated = tmp_path / "umov" / "other.json"
+    unrelated.write_text("{}")
     (tmp_path / "other.json").write_text("{}")
     answer = client.post("/acknowledge", json={"name": name}, headers={"Origin": "http://127.0.0.1:8000"})
     assert answer.status_code == 404
-    assert other.exists()
+    assert unrelated.exists()
     assert (tmp_path / "other.json").exists()
     assert alarm.exists()
 

@@ -18,8 +18,8 @@ from processing.storage.captures.schema import CaptureHeader, create_layout
 from viewer.library import Library
 
 
-def asked(address, what):
-    with urllib.request.urlopen(f"{address}/{what}") as answer:
+def asked(address, page):
+    with urllib.request.urlopen(f"{address}/{page}") as answer:
         return answer.read()
 
 
@@ -41,8 +41,8 @@ def test_states_appear_as_they_are_written(lab, address):
         for state in range(3):
             frame = np.full((1, 6, 8), 700 + state, np.uint16)
             file.write_state(state, frame, {"psg": (state, state)}, {"exposure_s": 0.01})
-            told = json.loads(asked(address, "states?file=now.h5.partial"))
-            assert (len(told["number"]), told["planned"], told["status"]) == (state + 1, 5, "running")
+            states = json.loads(asked(address, "states?file=now.h5.partial"))
+            assert (len(states["number"]), states["planned"], states["status"]) == (state + 1, 5, "running")
             counts = np.frombuffer(asked(address, "frame?file=now.h5.partial&state=-1"), "<f4")[:48]
             assert np.all(counts == 700 + state)
         assert 'data-writing="yes"' in asked(address, "capture?file=now.h5.partial").decode()

@@ -14,8 +14,8 @@ from processing.storage.products.product import Product
 
 
 def plane(answer):
-    told = json.loads(answer.headers["x-plane"])
-    return np.frombuffer(answer.content, "<f4").reshape(-1, told["rows"], told["columns"]), told
+    header = json.loads(answer.headers["x-plane"])
+    return np.frombuffer(answer.content, "<f4").reshape(-1, header["rows"], header["columns"]), header
 
 
 def test_the_first_page_lists_what_is_there_and_names_what_is_broken(lab, client, drr_capture):
@@ -60,11 +60,11 @@ def test_a_changed_file_is_read_again(client, drr_capture):
 
 def test_a_frame_is_the_counts_of_the_file(client, drr_capture):
     drr_capture("one.h5")
-    (counts, red), told = plane(client.get("/frame", params={"file": "one.h5", "state": 0}))
+    (counts, red), header = plane(client.get("/frame", params={"file": "one.h5", "state": 0}))
     assert counts.shape == (12, 16)
     assert np.all(counts == 64)
     assert not red.any()
-    assert told["step"] == 1
+    assert header["step"] == 1
 
 
 def test_a_reduced_frame_keeps_the_mean_and_every_saturated_pixel(lab, client, synthetic_capture):
@@ -72,31 +72,31 @@ def test_a_reduced_frame_keeps_the_mean_and_every_saturated_pixel(lab, client, s
     frames[0, 0, 57, 101] = 4095
     frames[0, 0, ::2] += 2
     synthetic_capture(frames, {}, name="lab/one.h5", detector={"bits": 12})
-    (counts, red), told = plane(client.get("/frame", params={"file": "one.h5", "state": 0, "most": 16}))
-    step = told["step"]
+    (counts, red), header = plane(client.get("/frame", params={"file": "one.h5", "state": 0, "most": 16}))
+    step = header["step"]
     assert max(counts.shape) <= 16
     assert np.median(counts) == pytest.approx(1001, abs=0.2)
     assert np.argwhere(red).tolist() == [[57 // step, 101 // step]]
-    part, told = plane(
+    part, header = plane(
         client.get("/frame", params={"file": "one.h5", "x0": 100, "x1": 110, "y0": 50, "y1": 60, "most": 16})
     )
-    assert (told["x0"], told["y0"], told["step"]) == (100, 50, 1)
+    assert (header["x0"], header["y0"], header["step"]) == (100, 50, 1)
     assert np.argwhere(part[1]).tolist() == [[7, 1]]
 
 
 def test_the_histogram_counts_every_pixel_once(client, drr_capture):
     drr_capture("one.h5")
-    told = client.get("/histogram", params={"file": "one.h5", "state": 10}).json()
-    assert sum(told["pixels"]) == 12 * 16
-    widths = np.diff(told["edges"])
+    histogram = client.get("/histogram", params={"file": "one.h5", "state": 10}).json()
+    assert sum(histogram["pixels"]) == 12 * 16
+    widths = np.diff(histogram["edges"])
     assert np.all(widths == widths[0])
     assert widths[0] == round(widths[0])
 
 
-@pytest.mark.parametrize("asked", [{"state": 44}, {"state": "x"}, {"channel": 1}, {"x0": "nan"}, {"state": -45}])
-def test_what_is_not_there_is_refused_in_words(client, drr_capture, asked):
+@pytest.mark.parametrize("query", [{"state": 44}, {"state": "x"}, {"channel": 1}, {"x0": "nan"}, {"state": -45}])
+def test_what_is_not_there_is_refused_in_words(client, drr_capture, query):
     drr_capture("one.h5")
-    answer = client.get("/frame", params={"file": "one.h5", **asked})
+    answer = client.get("/frame", params={"file": "one.h5", **query})
     assert answer.status_code == 422
     assert "Traceback" not in answer.text
 
@@ -105,17 +105,17 @@ def test_a_pixel_is_reduced_as_its_product_is(lab, client, drr_capture):
     path = drr_capture("one.h5")
     product = Reduction(path).make()
     pixel = {"file": "one.h5", "x0": 5, "y0": 7}
-    found = client.get("/curve", params=pixel).json()
+    curve = client.get("/curve", params=pixel).json()
     matrix = client.get("/matrix", params=pixel).json()["matrix"]
-    with Product(product) as there:
-        m = there.get("mueller")[:, :, 7, 5].astype(float)
-        error = there.get("mueller_errors")[0, 0, 7, 5]
+    with Product(product) as reader:
+        m = reader.get("mueller")[:, :, 7, 5].astype(float)
+        error = reader.get("mueller_errors")[0, 0, 7, 5]
     np.testing.assert_allclose(matrix["mueller"], m / m[0, 0], atol=1e-5)
     assert matrix["m00_error"] == pytest.approx(error, rel=1e-4)
-    residual = np.array(found["fit"]["residual"])
-    assert found["fit"]["states"] == list(range(4, 44))
+    residual = np.array(curve["fit"]["residual"])
+    assert curve["fit"]["states"] == list(range(4, 44))
     assert np.sqrt(np.mean(residual**2)) < 1.5
-    assert np.ptp(found["fit"]["signal"]) > 200
+    assert np.ptp(curve["fit"]["signal"]) > 200
 
 
 def test_the_noise_that_a_states_file_states_is_that_of_the_curve(lab, client, configs):
@@ -159,23 +159,23 @@ def test_a_super_pixel_has_a_curve_for_each_analyzer_and_a_stokes_vector(client,
         detector={"black_level_counts": 64.0, "gain_e_per_count": 2.6, "read_noise_e": 2.3, "bits": 12},
     )
     path.rename(lab / "mosaic.h5")
-    asked = {"file": "mosaic.h5", "x0": 0, "y0": 0, "x1": 12, "y1": 8}
-    fit = client.get("/curve", params=asked).json()["fit"]
+    query = {"file": "mosaic.h5", "x0": 0, "y0": 0, "x1": 12, "y1": 8}
+    fit = client.get("/curve", params=query).json()["fit"]
     assert fit["series"] == ["0°", "45°", "90°", "135°"]
     assert fit["chi_square"] == pytest.approx(1, abs=0.5)
     np.testing.assert_allclose(fit["fitted"][:4], [650, 400, 350, 600], rtol=0.01)
     for name, true in (("S0", 1000), ("S1/S0", 0.3), ("S2/S0", -0.2), ("AoLP / degrees", 163.15)):
-        found = fit["stokes"][name]
-        assert abs(found["value"] - true) < 4 * found["error"] < 0.03 * abs(true), name
+        element = fit["stokes"][name]
+        assert abs(element["value"] - true) < 4 * element["error"] < 0.03 * abs(true), name
     # One pixel is widened to its super-pixel.
-    one = client.get("/curve", params={"file": "mosaic.h5", "x0": 5, "y0": 3}).json()["fit"]
-    assert "columns 4 to 5, rows 2 to 3" in one["told"]
-    assert one["stokes"]["S0"]["error"] == pytest.approx(fit["stokes"]["S0"]["error"] * np.sqrt(24), rel=0.05)
-    assert client.get("/matrix", params=asked).json().keys() == {"where"}
+    single = client.get("/curve", params={"file": "mosaic.h5", "x0": 5, "y0": 3}).json()["fit"]
+    assert "columns 4 to 5, rows 2 to 3" in single["told"]
+    assert single["stokes"]["S0"]["error"] == pytest.approx(fit["stokes"]["S0"]["error"] * np.sqrt(24), rel=0.05)
+    assert client.get("/matrix", params=query).json().keys() == {"where"}
     # Its product, where it is.
     product = Reduction(lab / "mosaic.h5").make()
-    there = client.get("/probe", params={"file": product.name, "x0": 5, "y0": 3}).json()
-    assert there["fit"]["stokes"] == one["stokes"]
+    probe = client.get("/probe", params={"file": product.name, "x0": 5, "y0": 3}).json()
+    assert probe["fit"]["stokes"] == single["stokes"]
 
 
 def test_a_super_pixel_behind_a_turned_generator_has_a_curve_for_each_analyzer_and_a_matrix(
@@ -201,20 +201,20 @@ def test_a_super_pixel_behind_a_turned_generator_has_a_curve_for_each_analyzer_a
         instrument_yaml=file.read_text(),
         detector=detector,
     )
-    asked = {"file": "turned.h5", "x0": 3, "y0": 1}
-    fit = client.get("/curve", params=asked).json()["fit"]
+    query = {"file": "turned.h5", "x0": 3, "y0": 1}
+    fit = client.get("/curve", params=query).json()["fit"]
     assert fit["series"] == ["0°", "45°", "90°", "135°"]
     assert "columns 2 to 3, rows 0 to 1" in fit["told"]
     np.testing.assert_allclose(
         fit["fitted"][:4], 2 * np.array([signal[n][0] for n in ("0", "45", "90", "135")]), rtol=1e-3
     )
-    matrix = client.get("/matrix", params=asked).json()["matrix"]
+    matrix = client.get("/matrix", params=query).json()["matrix"]
     np.testing.assert_allclose(np.array(matrix["mueller"], float)[:3], m[:3], atol=2e-3)
     assert np.isnan(np.array(matrix["mueller"], float)[3]).all()
     # Its product has one pixel for each super-pixel.
     product = Reduction(path).make()
-    there = client.get("/probe", params={"file": product.name, "x0": 1, "y0": 0}).json()
-    assert there["fit"] == fit
+    probe = client.get("/probe", params={"file": product.name, "x0": 1, "y0": 0}).json()
+    assert probe["fit"] == fit
     # A region is the mean of its super-pixels, whole.
     region = client.get("/curve", params={"file": "turned.h5", "x0": 1, "y0": 1, "x1": 5, "y1": 2}).json()["fit"]
     np.testing.assert_allclose(region["fitted"], np.array(fit["fitted"]) / 2 * 7 / 3, rtol=1e-3)
@@ -265,10 +265,10 @@ def test_a_pixel_of_a_partial_polarimeter_has_the_elements_that_it_sees(client, 
     detector = {"black_level_counts": 12.0, "gain_e_per_count": 1.0, "read_noise_e": 2.0, "bits": 16}
     path = synthetic_capture(frames, angles, name="lab/one.h5", instrument_yaml=text, detector=detector)
     Reduction(path).make()
-    for what, file in (("curve", "one.h5"), ("matrix", "one.h5"), ("probe", "one.mueller.h5")):
-        answer = client.get(what, params={"file": file, "x0": 2, "y0": 1})
+    for page, file in (("curve", "one.h5"), ("matrix", "one.h5"), ("probe", "one.mueller.h5")):
+        answer = client.get(page, params={"file": file, "x0": 2, "y0": 1})
         assert answer.status_code == 200, answer.text
-        if what != "curve":
+        if page != "curve":
             m = np.array(answer.json()["matrix"]["mueller"], float)
             np.testing.assert_allclose(m[:3, :3], np.diag([1, 0.6, 0.5]), atol=1e-3)
             assert np.isnan([*m[3], *m[:, 3]]).all()
@@ -277,8 +277,8 @@ def test_a_pixel_of_a_partial_polarimeter_has_the_elements_that_it_sees(client, 
 
 def test_a_probe_outside_the_image_is_refused(client, drr_capture):
     drr_capture("one.h5")
-    for asked in ({"x0": 16, "y0": 0}, {"x0": 5, "y0": 3, "x1": 5, "y1": 9}, {"x0": 1}, {"x0": 0, "y0": -1}):
-        assert client.get("/curve", params={"file": "one.h5", **asked}).status_code == 422
+    for query in ({"x0": 16, "y0": 0}, {"x0": 5, "y0": 3, "x1": 5, "y1": 9}, {"x0": 1}, {"x0": 0, "y0": -1}):
+        assert client.get("/curve", params={"file": "one.h5", **query}).status_code == 422
 
 
 def test_counts_that_are_none_are_told_as_unknown(client, synthetic_capture):

@@ -39,13 +39,13 @@ def diagnosed(lab, drr_capture):
     effect = AppliedEffect.model_validate(
         {"kind": "psa_azimuth", "element": "psa_retarder", "parameters": {"azimuth": {"value": 0.5, "unit": "degree"}}}
     )
-    found = Diagnosis(
+    diagnosis = Diagnosis(
         **FOUND,
         effects=(),
         recommendation="Capture <b>air</b>.",
         correction=Correction(effects=(effect,)),
     )
-    (folder / "diagnosis.json").write_text(found.model_dump_json())
+    (folder / "diagnosis.json").write_text(diagnosis.model_dump_json())
     return name
 
 
@@ -61,12 +61,12 @@ def test_the_page_tells_the_verdict_and_proposes_a_free_name(lab, client, diagno
 
 def test_an_accepted_model_is_a_new_file_with_its_note(lab, client, diagnosed):
     (lab / "taken.yaml").write_text("mine")
-    asked = {"name": diagnosed, "accept": "yes", "file": "taken.yaml", "note": "seen\nat the bench"}
-    taken = client.post("/decide", json=asked, headers=ORIGIN)
-    assert (taken.status_code, "is not replaced" in taken.text) == (422, True)
+    decision = {"name": diagnosed, "accept": "yes", "file": "taken.yaml", "note": "seen\nat the bench"}
+    answer = client.post("/decide", json=decision, headers=ORIGIN)
+    assert (answer.status_code, "is not replaced" in answer.text) == (422, True)
     assert (lab / "taken.yaml").read_text() == "mine"
-    asked["file"] = "new.yaml"
-    assert client.post("/decide", json=asked, headers=ORIGIN).json() == {"files": ["new.yaml"]}
+    decision["file"] = "new.yaml"
+    assert client.post("/decide", json=decision, headers=ORIGIN).json() == {"files": ["new.yaml"]}
     text = (lab / "new.yaml").read_text()
     assert "# seen\n# at the bench\n" in text
     assert [effect.kind for effect in InstrumentModel.load(lab / "new.yaml").effects] == ["psa_azimuth"]
@@ -102,8 +102,8 @@ def test_a_rejected_model_leaves_its_note_and_no_file(lab, client, diagnosed):
 
 @pytest.mark.parametrize("file", ["../new.yaml", "/tmp/new.yaml", ".new.yaml", "new.h5", "", "a/b.yaml"])
 def test_a_model_goes_nowhere_else(lab, client, diagnosed, file):
-    asked = {"name": diagnosed, "accept": "yes", "file": file, "note": ""}
-    answer = client.post("/decide", json=asked, headers=ORIGIN)
+    decision = {"name": diagnosed, "accept": "yes", "file": file, "note": ""}
+    answer = client.post("/decide", json=decision, headers=ORIGIN)
     assert (answer.status_code, "plain file name" in answer.text) == (422, True)
 
 
@@ -133,11 +133,11 @@ def surface_diagnosed(lab, drr_capture, configs):
     diagnoses = Diagnoses(Library(lab))
     surface = (configs / "materials/red_print.yaml", configs / "geometries/one_inch_sphere.yaml")
     name, folder = diagnoses.begin([drr_capture("one.h5")], None, surface)
-    found = {"evidence": 900.0, "indistinguishable_from": (), "scope": "instrument", "removal_chance": 0.0}
+    common = {"evidence": 900.0, "indistinguishable_from": (), "scope": "instrument", "removal_chance": 0.0}
     arm = {"arm": {"value": 0.7, "unit": "degree"}}
     effects = (
-        FoundEffect(kind="arm_zero", element=None, parameters=arm, confident=True, **found),
-        FoundEffect(kind="refractive_index", element=None, parameters={}, confident=True, **found),
+        FoundEffect(kind="arm_zero", element=None, parameters=arm, confident=True, **common),
+        FoundEffect(kind="refractive_index", element=None, parameters={}, confident=True, **common),
     )
     applied = tuple(AppliedEffect(kind=e.kind, parameters=e.parameters) for e in effects)
     diagnosis = SurfaceDiagnosis(
@@ -160,8 +160,10 @@ def test_an_accepted_surface_is_a_new_material_and_a_new_geometry(lab, client, s
     assert "red 3D print: explained" in page
     assert "disagree with the material on its geometry" in page
     assert 'value="red_3D_print_2.yaml"' in page
-    asked = {"name": surface_diagnosed, "accept": "yes", "file": "print.yaml", "note": "looked at twice"}
-    assert client.post("/decide", json=asked, headers=ORIGIN).json() == {"files": ["print.yaml", "print.geometry.yaml"]}
+    decision = {"name": surface_diagnosed, "accept": "yes", "file": "print.yaml", "note": "looked at twice"}
+    assert client.post("/decide", json=decision, headers=ORIGIN).json() == {
+        "files": ["print.yaml", "print.geometry.yaml"]
+    }
     for file in ("print.yaml", "print.geometry.yaml"):
         assert "# looked at twice\n" in (lab / file).read_text()
         assert f"<code>{file}</code>" in client.get("/diagnosis", params={"name": surface_diagnosed}).text
@@ -175,20 +177,20 @@ def test_an_accepted_surface_is_a_new_material_and_a_new_geometry(lab, client, s
 
 def test_a_surface_whose_correction_is_refused_is_not_written(lab, client, surface_diagnosed):
     result = Diagnoses(Library(lab)).folder(surface_diagnosed) / "diagnosis.json"
-    found = json.loads(result.read_text())
-    found["correction"]["refused"] = "it would make worse: rms: 1 to 2"
-    result.write_text(json.dumps(found))
+    document = json.loads(result.read_text())
+    document["correction"]["refused"] = "it would make worse: rms: 1 to 2"
+    result.write_text(json.dumps(document))
     assert not Diagnoses(Library(lab)).story(surface_diagnosed).writes
-    asked = {"name": surface_diagnosed, "accept": "yes", "file": "print.yaml", "note": ""}
-    answer = client.post("/decide", json=asked, headers=ORIGIN)
+    decision = {"name": surface_diagnosed, "accept": "yes", "file": "print.yaml", "note": ""}
+    answer = client.post("/decide", json=decision, headers=ORIGIN)
     assert (answer.status_code, "it would make worse" in answer.text) == (422, True)
     assert not list(lab.glob("print*"))
 
 
 def test_nothing_of_an_accepted_surface_replaces_a_file(lab, client, surface_diagnosed):
     (lab / "print.geometry.yaml").write_text("mine")
-    asked = {"name": surface_diagnosed, "accept": "yes", "file": "print.yaml", "note": ""}
-    answer = client.post("/decide", json=asked, headers=ORIGIN)
+    decision = {"name": surface_diagnosed, "accept": "yes", "file": "print.yaml", "note": ""}
+    answer = client.post("/decide", json=decision, headers=ORIGIN)
     assert (answer.status_code, "is not replaced" in answer.text) == (422, True)
     assert (lab / "print.geometry.yaml").read_text() == "mine"
     assert not (lab / "print.yaml").exists()

@@ -27,9 +27,9 @@ PATIENCE_MS = 300_000
 LOCAL = re.compile(r"http://127\.0\.0\.1:|data:|blob:|about:")
 
 
-def complains(told: ConsoleMessage) -> bool:
+def complains(message: ConsoleMessage) -> bool:
     """Whether a page complains; an answer of 4xx is part of the test."""
-    return told.type == "error" and "status of 4" not in told.text
+    return message.type == "error" and "status of 4" not in message.text
 
 
 @pytest.fixture
@@ -68,8 +68,8 @@ def window(browser):
     def tab() -> Page:
         page = context.new_page()
         page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda told: wrong.append(told.text) if complains(told) else None)
-        page.on("request", lambda asked: None if LOCAL.match(asked.url) else wrong.append(asked.url))
+        page.on("console", lambda message: wrong.append(message.text) if complains(message) else None)
+        page.on("request", lambda request: None if LOCAL.match(request.url) else wrong.append(request.url))
         return page
 
     yield tab
@@ -142,7 +142,7 @@ def test_a_whole_evening(lab, address, window, draw_region):
     _narrow_and_dark(page, address, capture)
 
 
-def _start_watch_stop_resume(page: Page, other: Page, lab: Path, address: str) -> None:
+def _start_watch_stop_resume(page: Page, second: Page, lab: Path, address: str) -> None:
     page.get_by_label("Start a campaign").select_option("evening.yaml")
     page.get_by_role("button", name="Start").click()
     page.get_by_role("link", name="The campaign").click()
@@ -153,18 +153,18 @@ def _start_watch_stop_resume(page: Page, other: Page, lab: Path, address: str) -
     assert all(0 <= angle < 360 for angle in degrees)
 
     # Another tab sees the same, and the capture that is being written.
-    other.goto(page.url)
-    expect(other.locator("#captures")).to_have_text(re.compile(r"\d+ of 26"))
-    expect(other.locator("#lampwords")).to_have_text(re.compile("dark-corrected mean of each state"))
-    expect(other.locator("#frame .nsewdrag")).to_be_attached()
+    second.goto(page.url)
+    expect(second.locator("#captures")).to_have_text(re.compile(r"\d+ of 26"))
+    expect(second.locator("#lampwords")).to_have_text(re.compile("dark-corrected mean of each state"))
+    expect(second.locator("#frame .nsewdrag")).to_be_attached()
     # What has ended is told there without loading the page anew: sign with its link, bar and log.
-    expect(other.locator("a.cell.done").first).to_be_attached()
-    expect(other.locator("#log")).to_contain_text("capture ended: 001_")
-    expect(other.locator("#timeline")).to_contain_text("001_")
-    keep(other, "campaign")
+    expect(second.locator("a.cell.done").first).to_be_attached()
+    expect(second.locator("#log")).to_contain_text("capture ended: 001_")
+    expect(second.locator("#timeline")).to_contain_text("001_")
+    keep(second, "campaign")
     partial = next((lab / "evening").glob("*.partial"), None)
     if partial is not None:
-        other.goto(f"{address}/capture?{urllib.parse.urlencode({'file': f'evening/{partial.name}'})}")
+        second.goto(f"{address}/capture?{urllib.parse.urlencode({'file': f'evening/{partial.name}'})}")
 
     page.get_by_role("button", name="Stop").click()
     expect(page.locator("#run")).to_be_hidden()
@@ -186,7 +186,7 @@ def _start_watch_stop_resume(page: Page, other: Page, lab: Path, address: str) -
     statuses = [entry["status"] for entry in json.loads((lab / "evening" / "index.json").read_text()).values()]
     assert statuses[0] == "complete"
     assert "failed" not in statuses
-    other.close()
+    second.close()
 
 
 def _ended(lab: Path) -> None:
@@ -273,15 +273,15 @@ def _narrow_and_dark(page: Page, address: str, capture: str) -> None:
     page.emulate_media(color_scheme="dark")
     file = urllib.parse.urlencode({"file": capture})
     product = urllib.parse.urlencode({"file": capture.replace(".h5", ".mueller.h5")})
-    for what in ("", "campaign?folder=evening", f"capture?{file}#x=66&y=54", f"product?{product}"):
+    for address_of_page in ("", "campaign?folder=evening", f"capture?{file}#x=66&y=54", f"product?{product}"):
         page.goto("about:blank")
-        page.goto(f"{address}/{what}")
-        if what:
+        page.goto(f"{address}/{address_of_page}")
+        if address_of_page:
             ready(page)
-        assert fits(page), what
+        assert fits(page), address_of_page
         background = page.evaluate("getComputedStyle(document.body).backgroundColor")
         assert max(int(part) for part in re.findall(r"\d+", background)) < 60
-        if what.startswith("capture"):
+        if address_of_page.startswith("capture"):
             keep(page, "narrow_capture")
     page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.className") == "skip"

@@ -27,9 +27,9 @@ from viewer.starting import KINDS
 
 
 def until(condition):
-    while not (found := condition()):
+    while not (value := condition()):
         time.sleep(0.01)
-    return found
+    return value
 
 
 def report(number):
@@ -38,13 +38,13 @@ def report(number):
 
 
 def test_a_run_says_where_it_is_while_it_runs_and_nothing_afterwards(lab):
-    with RunFile(lab, simulated=True) as told:
-        told.campaign_progress(2, 5, "three.h5")
-        told.run_started("red sphere", None, 44, None)
+    with RunFile(lab, simulated=True) as run_file:
+        run_file.campaign_progress(2, 5, "three.h5")
+        run_file.run_started("red sphere", None, 44, None)
         for number in range(41):
-            told.state_done(report(number))
-        told.warning("a wire is loose")
-        facts = until(lambda: (found := running_in(lab)) and found["done"] == 41 and found["messages"] and found)
+            run_file.state_done(report(number))
+        run_file.warning("a wire is loose")
+        facts = until(lambda: (run := running_in(lab)) and run["done"] == 41 and run["messages"] and run)
         assert (facts["capture"], facts["campaign_total"], facts["pending"]) == ("three.h5", 5, 44)
         assert "a wire is loose" in facts["messages"][0]
         assert facts["left_s"] >= 0
@@ -74,9 +74,9 @@ def test_a_process_that_has_ended_or_another_with_its_number_runs_nothing(lab):
 
 
 def test_a_folder_that_cannot_be_written_keeps_no_run_from_measuring(lab):
-    with RunFile(lab / "gone", simulated=False) as told:
-        told.run_started("x", None, 3, None)
-        told.state_done(report(0))
+    with RunFile(lab / "gone", simulated=False) as run_file:
+        run_file.run_started("x", None, 3, None)
+        run_file.state_done(report(0))
 
 
 def campaign(lab, drr_capture):
@@ -127,8 +127,8 @@ def test_each_capture_of_a_campaign_has_its_sign(lab, client, drr_capture):
     # Killed: the log does not say when, the file says when its last state came.
     written = datetime.fromtimestamp((folder / "2.h5").stat().st_mtime, UTC)
     assert datetime.fromisoformat(view.bars[1].end) == written
-    (*_, taken) = read_campaign(folder, Library(lab), running="2.h5").bars
-    assert (taken.status, taken.end) == ("running", None)
+    (*_, last) = read_campaign(folder, Library(lab), running="2.h5").bars
+    assert (last.status, last.end) == ("running", None)
     (block,) = view.blocks()
     assert block.angles_deg == (31, 32, 33, 34, 35)
     # What is running now is running, whatever its file looks like.
@@ -140,17 +140,17 @@ def test_each_capture_of_a_campaign_has_its_sign(lab, client, drr_capture):
 
 def test_a_capture_that_ends_while_the_page_is_made_is_shown(lab, drr_capture):
     folder = campaign(lab, drr_capture)
-    whole = folder / "1.h5"
-    partial = whole.rename(f"{whole}.partial")
+    capture = folder / "1.h5"
+    partial = capture.rename(f"{capture}.partial")
 
     class Ending(Library):
         def holds(self, path):
-            found = super().holds(path)
-            if path == partial and found:
-                partial.rename(whole)
-            return found
+            holds_path = super().holds(path)
+            if path == partial and holds_path:
+                partial.rename(capture)
+            return holds_path
 
-    (shown,) = [cell for cell in read_campaign(folder, Ending(lab)).cells if cell.name == whole.name]
+    (shown,) = [cell for cell in read_campaign(folder, Ending(lab)).cells if cell.name == capture.name]
     assert shown.status == "done"
 
 
@@ -179,11 +179,11 @@ def flickering(drr_capture, configs):
 
 def test_the_lamp_is_told_from_polarization(flickering):
     with Capture(flickering) as capture:
-        told = lamp(capture)
+        source = lamp(capture)
         modulated = capture.column("monitor")[4:]
     assert np.ptp(modulated) / modulated.mean() > 0.3
-    ratio = np.array(told["ratio"])
-    assert told["states"][int(np.argmax(ratio))] == 21
+    ratio = np.array(source["ratio"])
+    assert source["states"][int(np.argmax(ratio))] == 21
     assert ratio.max() == pytest.approx(1.01, abs=1e-6)
     assert np.std(np.delete(ratio, 17)) < 0.002
 
@@ -202,10 +202,10 @@ def test_the_lamp_is_told_where_a_frame_holds_several_channels(name, configs, sy
     with h5py.File(path, "r+") as h5:
         h5["entry/states/monitor"][...] = of_frame
     with Capture(path) as capture:
-        told = lamp(capture)
+        source = lamp(capture)
     assert np.ptp(of_frame) / of_frame.mean() > 0.1
-    ratio = np.array(told["ratio"])
-    assert told["states"][int(np.argmax(ratio))] == 21
+    ratio = np.array(source["ratio"])
+    assert source["states"][int(np.argmax(ratio))] == 21
     assert ratio.max() == pytest.approx(1.01, abs=1e-6)
 
 
@@ -237,7 +237,7 @@ def test_a_command_is_followed_to_its_end_and_known_afterwards(lab, client, drr_
 
 
 @pytest.mark.parametrize(
-    "asked",
+    "order",
     [
         {"what": "shell"},
         {"what": "reduce", "file": "../one.h5"},
@@ -249,9 +249,9 @@ def test_a_command_is_followed_to_its_end_and_known_afterwards(lab, client, drr_
         ["what"],
     ],
 )
-def test_nothing_else_is_started(lab, client, drr_capture, asked):
+def test_nothing_else_is_started(lab, client, drr_capture, order):
     drr_capture("one.h5", shape=(4, 4))
-    answer = client.post("/start", json=asked, headers={"origin": "http://127.0.0.1:8000"})
+    answer = client.post("/start", json=order, headers={"origin": "http://127.0.0.1:8000"})
     assert answer.status_code in (404, 422)
     assert Jobs(lab).all() == []
 
@@ -270,29 +270,29 @@ def test_a_surface_is_diagnosed_with_a_material_and_a_geometry(lab, client, drr_
     page = client.get("/capture", params={"file": "one.h5"}).text
     for name in ("mine.yaml", "ball.yaml", "example: red_print", "example: one_inch_sphere"):
         assert f"<option>{name}</option>" in page
-    asked = {"files": "one.h5", "material": "mine.yaml", "geometry": "example: one_inch_sphere"}
-    command = KINDS["surface"](Library(lab), Told(), asked)
-    given = dict(zip(command[2::2], command[3::2], strict=True))
-    assert Path(given["--reflectance"]).read_text() == (lab / "mine.yaml").read_text()
-    assert ViewingGeometry.load(given["--geometry"]) == ViewingGeometry.load(lab / "ball.yaml")
-    assert Path(given["--instrument"]).read_text() == (configs / "instruments/rgb950.yaml").read_text()
+    order = {"files": "one.h5", "material": "mine.yaml", "geometry": "example: one_inch_sphere"}
+    command = KINDS["surface"](Library(lab), Told(), order)
+    options = dict(zip(command[2::2], command[3::2], strict=True))
+    assert Path(options["--reflectance"]).read_text() == (lab / "mine.yaml").read_text()
+    assert ViewingGeometry.load(options["--geometry"]) == ViewingGeometry.load(lab / "ball.yaml")
+    assert Path(options["--instrument"]).read_text() == (configs / "instruments/rgb950.yaml").read_text()
     # A mesh is found from the copy as well.
     text = (lab / "ball.yaml").read_text().replace("{kind: sphere, radius_mm: 12.7}", "{kind: mesh, file: vase.stl}")
     (lab / "vase.yaml").write_text(text)
-    command = KINDS["surface"](Library(lab), Told(), asked | {"geometry": "vase.yaml"})
+    command = KINDS["surface"](Library(lab), Told(), order | {"geometry": "vase.yaml"})
     copied = ViewingGeometry.load(command[command.index("--geometry") + 1])
     assert copied == ViewingGeometry.load(lab / "vase.yaml")
     assert copied.shape.file == str(lab / "vase.stl")
     with pytest.raises(NotHere, match="no such material"):
-        KINDS["surface"](Library(lab), Told(), asked | {"material": "/etc/passwd"})
+        KINDS["surface"](Library(lab), Told(), order | {"material": "/etc/passwd"})
 
 
 def test_a_product_of_another_instrument_file_is_called_what_it_is(lab, drr_capture):
     mosaic = {"mosaic": (("90", "45"), ("135", "0")), "instrument_yaml": ""}
     for name, header in (("mueller", {}), ("stokes", mosaic)):
         drr_capture("one.h5", shape=(4, 4), **header)
-        asked = {"file": "one.h5", "instrument": "example: rgb950"}
-        assert KINDS["reduce"](Library(lab), Told(), asked)[-1] == str(lab / f"one.rgb950.{name}.h5")
+        order = {"file": "one.h5", "instrument": "example: rgb950"}
+        assert KINDS["reduce"](Library(lab), Told(), order)[-1] == str(lab / f"one.rgb950.{name}.h5")
 
 
 def test_a_job_that_was_cut_off_takes_no_page_away(lab, client):
@@ -304,5 +304,5 @@ def test_a_job_that_was_cut_off_takes_no_page_away(lab, client):
 
 @pytest.mark.parametrize("name", ["", "..", "../../x", "nothing", "x" * 300, "x" * 5000, "a/b", "a\0b"])
 def test_a_job_or_a_diagnosis_that_is_not_there(client, name):
-    for what in ("job", "diagnosis", "diagnosis-report", "residual-map"):
-        assert client.get(f"/{what}", params={"name": name}).status_code == 404
+    for page in ("job", "diagnosis", "diagnosis-report", "residual-map"):
+        assert client.get(f"/{page}", params={"name": name}).status_code == 404

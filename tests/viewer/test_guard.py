@@ -64,8 +64,8 @@ def test_nothing_outside_the_folder_is_read(lab, name):
     (lab.parent / "secret.h5").write_bytes(b"secret")
     (lab / "link.h5").symlink_to(lab.parent / "secret.h5")
     (lab / "loop.h5").symlink_to("loop.h5")
-    for what in ("capture", "frame", "histogram", "curve"):
-        answer = browser(lab).get(f"/{TOKEN}/{what}", params={"file": name})
+    for page in ("capture", "frame", "histogram", "curve"):
+        answer = browser(lab).get(f"/{TOKEN}/{page}", params={"file": name})
         assert answer.status_code == 404
         assert "HDF5" not in answer.text
 

@@ -39,9 +39,9 @@ def copies(lab, path, count):
 
 def test_pages_have_every_capture_once_and_a_search_stays(client, lab, drr_capture):
     copies(lab, drr_capture("one.h5"), 2 * MOST)
-    seen = [names(client.get("/", params={"captures_page": page, "captures_sort": "name"}).text) for page in (1, 2, 3)]
-    assert [len(page) for page in seen] == [MOST, MOST, 1]
-    assert len({name for page in seen for name in page}) == 2 * MOST + 1
+    pages = [names(client.get("/", params={"captures_page": page, "captures_sort": "name"}).text) for page in (1, 2, 3)]
+    assert [len(page) for page in pages] == [MOST, MOST, 1]
+    assert len({name for page in pages for name in page}) == 2 * MOST + 1
     text = client.get("/", params={"q": "copy", "captures_page": 2}).text
     assert "page 2 of 2, 100 captures" in text
     assert "q=copy" in re.search(r'href="([^"]*)" rel="prev"', text)[1]
@@ -56,11 +56,11 @@ def test_a_second_start_reads_no_file_again(lab, drr_capture, monkeypatch):
     original = viewer.library._read
     monkeypatch.setattr(viewer.library, "_read", lambda *args: read.append(args[0].name) or original(*args))
     again = viewer.library.Library(lab)
-    found = [vars(e) for e in again.entries()]
+    after = [vars(e) for e in again.entries()]
     assert read == []
-    for one, other in zip(before, found, strict=True):
-        assert {k: v for k, v in one.items() if k != "header"} == {k: v for k, v in other.items() if k != "header"}
-        assert one["header"].sample == other["header"].sample
+    for first, second in zip(before, after, strict=True):
+        assert {k: v for k, v in first.items() if k != "header"} == {k: v for k, v in second.items() if k != "header"}
+        assert first["header"].sample == second["header"].sample
     # A file that changed is read again, a damaged index is none.
     os.utime(lab / "one.h5", (1, 1))
     again.entries()
@@ -78,11 +78,11 @@ def test_files_are_named_while_they_are_read(lab, drr_capture):
 
 def test_three_thousand_captures_have_their_first_page_in_a_second(lab, drr_capture, monkeypatch):
     path = drr_capture("one.h5")
-    (known,) = viewer.library.Library(lab).entries()
+    (entry,) = viewer.library.Library(lab).entries()
     copies(lab, path, 3000)
     with monkeypatch.context() as quick:
         # The first index opens every file, which takes a minute.
-        quick.setattr(viewer.library, "_read", lambda _, common: replace(known, **common))
+        quick.setattr(viewer.library, "_read", lambda _, common: replace(entry, **common))
         viewer.library.Library(lab).entries()
     times = []
     for _ in range(3):

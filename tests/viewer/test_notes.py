@@ -18,8 +18,8 @@ def test_a_note_and_tags_are_kept_shown_and_found(lab, client, drr_capture):
     drr_capture("one.h5")
     drr_capture("two.h5")
     assert write(client, text="the lamp was cold", tags=" Good, good , Good").json()["tags"] == ["Good", "good"]
-    (kept,) = json.loads((lab / ".umov-view/notes.json").read_text())["files"].items()
-    assert kept == ("one.h5", {"text": "the lamp was cold", "tags": ["Good", "good"]})
+    (note,) = json.loads((lab / ".umov-view/notes.json").read_text())["files"].items()
+    assert note == ("one.h5", {"text": "the lamp was cold", "tags": ["Good", "good"]})
     page = client.get("/", params={"q": "COLD good"}).text
     assert "the lamp was cold" in page
     assert re.findall(r'capture\?file=([\w.]+)"', page) == ["one.h5"]

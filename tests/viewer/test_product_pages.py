@@ -17,8 +17,8 @@ from processing.storage.products.product_writer import ProductWriter
 
 def plane(answer):
     assert answer.status_code == 200, answer.text
-    told = json.loads(answer.headers["x-plane"])
-    return np.frombuffer(answer.content, "<f4").reshape(-1, told["rows"], told["columns"]), told
+    header = json.loads(answer.headers["x-plane"])
+    return np.frombuffer(answer.content, "<f4").reshape(-1, header["rows"], header["columns"]), header
 
 
 @pytest.fixture
@@ -57,15 +57,15 @@ def test_signed_scales_are_symmetric_about_zero_and_a_turn_is_a_turn():
 
 
 def test_sixteen_elements_come_on_one_scale(lab, client, products):
-    elements, told = plane(client.get("/mueller", params={"file": "one.mueller.h5", "normalized": 1}))
-    with Product(products[0]) as there:
-        m = there.get("mueller").reshape(16, 12, 16)
+    elements, header = plane(client.get("/mueller", params={"file": "one.mueller.h5", "normalized": 1}))
+    with Product(products[0]) as reader:
+        m = reader.get("mueller").reshape(16, 12, 16)
     np.testing.assert_allclose(elements[1:], m[1:] / m[0], rtol=1e-5)
     np.testing.assert_allclose(elements[0], m[0])
-    assert told["low"] == -told["high"]
-    assert told["units"] == ""
-    errors, told = plane(client.get("/mueller", params={"file": "one.mueller.h5", "errors": 1}))
-    assert told["colours"] == "magma"
+    assert header["low"] == -header["high"]
+    assert header["units"] == ""
+    errors, header = plane(client.get("/mueller", params={"file": "one.mueller.h5", "errors": 1}))
+    assert header["colours"] == "magma"
     assert np.all(errors > 0)
 
 
@@ -73,21 +73,21 @@ def test_a_map_comes_with_its_errors_and_without_what_is_not_valid(client, produ
     xi, _ = plane(
         client.get("/plane", params={"file": "one.quantities.h5", "name": "coherency_eigenvalues", "index": 0})
     )
-    errors, told = plane(
+    errors, header = plane(
         client.get("/plane", params={"file": "one.quantities.h5", "name": "coherency_eigenvalues", "errors": 1})
     )
     assert np.median(xi) == pytest.approx(0.55, abs=0.01)
-    assert told["colours"] == "magma"
+    assert header["colours"] == "magma"
     assert 0 < np.median(errors) < 0.03
     page = client.get("/product", params={"file": "one.quantities.h5"}).text
     assert "one.mueller.h5" in page
 
 
 def test_a_pixel_of_a_product_leads_back_to_its_intensities(client, products):
-    found = client.get("/probe", params={"file": "one.mueller.h5", "x0": 3, "y0": 4}).json()
-    assert found["mask"] == "valid"
-    assert len(found["fit"]["signal"]) == 40
-    assert found["matrix"]["mueller"][1][1] == pytest.approx(0.5, abs=0.2)
+    probe = client.get("/probe", params={"file": "one.mueller.h5", "x0": 3, "y0": 4}).json()
+    assert probe["mask"] == "valid"
+    assert len(probe["fit"]["signal"]) == 40
+    assert probe["matrix"]["mueller"][1][1] == pytest.approx(0.5, abs=0.2)
     derived = client.get("/probe", params={"file": "one.quantities.h5", "x0": 3, "y0": 4}).json()
     named = {plane["name"]: plane for plane in derived["planes"]}
     assert sum(named["coherency_eigenvalues"]["value"]) == pytest.approx(1, abs=1e-5)
@@ -99,42 +99,42 @@ def test_what_differs_by_noise_alone_is_one_error_apart(client, drr_capture):
     for name in ("one", "two"):
         assert client.get("/capture", params={"file": f"{name}.h5"}).status_code == 200
     dark = {"a": "one.h5", "b": "two.h5", "state": 0}
-    (a, b, apart, _), told = plane(client.get("/difference", params=dark))
+    (a, b, apart, _), header = plane(client.get("/difference", params=dark))
     np.testing.assert_allclose(apart, a - b)
-    assert told["rms"] == 0
-    _, told = plane(client.get("/difference", params={**dark, "state": 10}))
-    assert told["rms_over"] == pytest.approx(1, abs=0.2)
+    assert header["rms"] == 0
+    _, header = plane(client.get("/difference", params={**dark, "state": 10}))
+    assert header["rms_over"] == pytest.approx(1, abs=0.2)
 
 
 def test_two_products_of_the_same_scene_differ_by_their_errors(client, lab, drr_capture):
     Reduction(drr_capture("one.h5")).make()
     Reduction(drr_capture("two.h5", seed_of_noise=2, mueller=np.diag([1.0, 0.6, 0.4, 0.3]))).make()
-    asked = {"a": "one.mueller.h5", "b": "two.mueller.h5", "name": "mueller"}
-    assert client.get("/compare", params=asked).status_code == 200
-    _, same = plane(client.get("/difference", params={**asked, "index": 10}))
-    (_, _, apart, _), other = plane(client.get("/difference", params={**asked, "index": 5}))
+    query = {"a": "one.mueller.h5", "b": "two.mueller.h5", "name": "mueller"}
+    assert client.get("/compare", params=query).status_code == 200
+    _, same = plane(client.get("/difference", params={**query, "index": 10}))
+    (_, _, apart, _), difference = plane(client.get("/difference", params={**query, "index": 5}))
     assert same["rms_over"] == pytest.approx(1, abs=0.2)
     assert np.median(apart) == pytest.approx(-0.1, abs=0.01)
-    assert other["rms_over"] > 2
+    assert difference["rms_over"] > 2
 
 
 def test_products_of_one_capture_share_its_noise(client, lab, drr_capture, configs, tmp_path):
     """Two instrument files: the difference scatters by far less than the noise of each, and by its own errors."""
     capture = drr_capture("one.h5")
-    other = tmp_path / "other.yaml"
-    other.write_text((configs / "instruments/rgb950.yaml").read_text().replace("662: 127.12", "662: 129.12"))
+    instrument = tmp_path / "other.yaml"
+    instrument.write_text((configs / "instruments/rgb950.yaml").read_text().replace("662: 127.12", "662: 129.12"))
     Reduction(capture).make()
-    Reduction(capture, other).make(out=lab / "other.mueller.h5")
-    asked = {"a": "one.mueller.h5", "b": "other.mueller.h5", "name": "mueller", "index": 10}
-    (_, _, apart, over), _ = plane(client.get("/difference", params=asked))
+    Reduction(capture, instrument).make(out=lab / "other.mueller.h5")
+    query = {"a": "one.mueller.h5", "b": "other.mueller.h5", "name": "mueller", "index": 10}
+    (_, _, apart, over), _ = plane(client.get("/difference", params=query))
     with Product(lab / "one.mueller.h5") as product:
         alone = np.median(product.get("mueller_errors")[2, 2] / product.get("mueller")[0, 0])
     assert np.nanstd(apart) < 0.3 * alone
     assert np.nanstd(over) == pytest.approx(1, abs=0.2)
     # So do maps of quantities.
-    (one, _, apart, over), _ = plane(client.get("/difference", params=asked | {"name": "depolarization_index"}))
-    assert np.nanmedian(one) == pytest.approx((0.5 / 3) ** 0.5, abs=0.02)
-    assert np.nanstd(apart) < 0.3 * np.nanstd(one)
+    (values, _, apart, over), _ = plane(client.get("/difference", params=query | {"name": "depolarization_index"}))
+    assert np.nanmedian(values) == pytest.approx((0.5 / 3) ** 0.5, abs=0.02)
+    assert np.nanstd(apart) < 0.3 * np.nanstd(values)
     assert np.nanstd(over) == pytest.approx(1, abs=0.25)
 
 
@@ -148,29 +148,29 @@ def test_a_difference_has_what_the_instruments_do_not_do_alike(client, lab, drr_
     # Another instrument whose uncertain inputs have the same names.
     files.append(tmp_path / "lent.yaml")
     files[-1].write_text(files[0].read_text().replace("name: RGB950", "name: RGB950 that was lent"))
-    one, two = drr_capture("one.h5"), drr_capture("two.h5", seed_of_noise=2)
-    three = drr_capture("three.h5", seed_of_noise=3, mueller=np.diag([1.0, 0.6, 0.1, 0.3]))
-    for k, (capture, file) in enumerate(((one, 0), (two, 0), (three, 0), (two, 1), (two, 2))):
+    first, second = drr_capture("one.h5"), drr_capture("two.h5", seed_of_noise=2)
+    third = drr_capture("three.h5", seed_of_noise=3, mueller=np.diag([1.0, 0.6, 0.1, 0.3]))
+    for k, (capture, file) in enumerate(((first, 0), (second, 0), (third, 0), (second, 1), (second, 2))):
         Reduction(capture, files[file]).make(out=lab / f"{k}.mueller.h5")
-    found = {}
+    headers = {}
     for k in (1, 2, 3, 4):
-        asked = {"a": "0.mueller.h5", "b": f"{k}.mueller.h5", "name": "mueller", "index": 10}
-        (_, _, apart, over), found[k] = plane(client.get("/difference", params=asked))
-        expected = np.hypot(found[k]["rms_noise"], found[k]["rms_systematic"])
+        query = {"a": "0.mueller.h5", "b": f"{k}.mueller.h5", "name": "mueller", "index": 10}
+        (_, _, apart, over), headers[k] = plane(client.get("/difference", params=query))
+        expected = np.hypot(headers[k]["rms_noise"], headers[k]["rms_systematic"])
         assert np.nanstd(apart) / np.nanstd(over) == pytest.approx(expected, rel=0.1)
     with Product(lab / "0.mueller.h5") as product:
         alone = np.median(product.get("mueller_systematic")[2, 2] / product.get("mueller")[0, 0])
     # What is left is the noise of the matrices that are moved.
-    assert found[1]["rms_systematic"] < 0.2 * alone
-    assert found[2]["rms_systematic"] > 0.3 * alone
-    assert found[3]["rms_systematic"] >= 0.99 * alone
-    assert found[4]["rms_systematic"] == pytest.approx(np.sqrt(2) * alone, rel=0.1)
+    assert headers[1]["rms_systematic"] < 0.2 * alone
+    assert headers[2]["rms_systematic"] > 0.3 * alone
+    assert headers[3]["rms_systematic"] >= 0.99 * alone
+    assert headers[4]["rms_systematic"] == pytest.approx(np.sqrt(2) * alone, rel=0.1)
 
 
-@pytest.mark.parametrize("asked", [{"index": 16}, {"index": "x"}, {"name": "nothing"}, {"name": ""}])
-def test_a_map_that_is_not_there_is_not_compared(client, products, asked):
-    both = {"a": "one.mueller.h5", "b": "one.mueller.h5", "name": "mueller"}
-    assert client.get("/difference", params=both | asked).status_code == 422
+@pytest.mark.parametrize("query", [{"index": 16}, {"index": "x"}, {"name": "nothing"}, {"name": ""}])
+def test_a_map_that_is_not_there_is_not_compared(client, products, query):
+    pair = {"a": "one.mueller.h5", "b": "one.mueller.h5", "name": "mueller"}
+    assert client.get("/difference", params=pair | query).status_code == 422
 
 
 def test_a_capture_and_a_product_are_not_compared(client, products):
@@ -201,13 +201,15 @@ def test_orientations_either_side_of_their_wrap_are_neighbours(name, period, cli
         with ProductWriter(lab / f"{file}.h5", "quantities", header, (1, 2), planes=planes, steps=()) as writer:
             writer.write(slice(0, 1), **{name: np.array([angles]), f"{name}_errors": np.full((1, 2), 2.0)})
             writer.seal({"warnings": []})
-    (_, _, apart, over), told = plane(client.get("/difference", params={"a": "a.h5", "b": "b.h5", "name": name}))
+    (_, _, apart, over), scale_header = plane(
+        client.get("/difference", params={"a": "a.h5", "b": "b.h5", "name": name})
+    )
     np.testing.assert_allclose(apart, [[2, -2]], atol=1e-4)
     np.testing.assert_allclose(over, [[2 / 8**0.5, -2 / 8**0.5]], atol=1e-4)
-    assert told["scales"][0] == {"colours": "twilight", "low": 0.0, "high": period}
-    (found,) = client.get("/probe", params={"file": "a.h5", "x0": 0, "x1": 2, "y0": 0, "y1": 1}).json()["planes"]
-    assert (found["value"][0] + 10) % period == pytest.approx(10, abs=1e-6)
-    assert found["error"][0] == pytest.approx(2 / 2**0.5)
+    assert scale_header["scales"][0] == {"colours": "twilight", "low": 0.0, "high": period}
+    (value,) = client.get("/probe", params={"file": "a.h5", "x0": 0, "x1": 2, "y0": 0, "y1": 1}).json()["planes"]
+    assert (value["value"][0] + 10) % period == pytest.approx(10, abs=1e-6)
+    assert value["error"][0] == pytest.approx(2 / 2**0.5)
 
 
 def test_an_angle_that_is_noise_has_no_colour(client, lab):
@@ -237,11 +239,11 @@ def test_a_pixel_of_an_extrapolated_image_has_its_matrix_with_errors(client, lab
             valid=np.ones((1, 2)),
         )
         writer.seal({"warnings": []})
-    there = client.get("/probe", params={"file": "e.h5", "x0": 1, "y0": 0}).json()["matrix"]
-    assert (there["m00"], there["m00_error"]) == (200, 2)
-    np.testing.assert_allclose(np.diag(there["mueller"]), [1, 0.5, 0.4, 0.3], rtol=1e-6)
+    matrix = client.get("/probe", params={"file": "e.h5", "x0": 1, "y0": 0}).json()["matrix"]
+    assert (matrix["m00"], matrix["m00_error"]) == (200, 2)
+    np.testing.assert_allclose(np.diag(matrix["mueller"]), [1, 0.5, 0.4, 0.3], rtol=1e-6)
     # One percent of alpha_0 and one of m00, which are not correlated here.
-    assert there["mueller_errors"][1][1] == pytest.approx(0.5 * 0.01 * 2**0.5, rel=1e-4)
+    assert matrix["mueller_errors"][1][1] == pytest.approx(0.5 * 0.01 * 2**0.5, rel=1e-4)
 
 
 def test_a_folder_that_was_moved_keeps_what_was_made_from_what(lab, client, products):
@@ -250,8 +252,8 @@ def test_a_folder_that_was_moved_keeps_what_was_made_from_what(lab, client, prod
     for path in lab.glob("*.h5"):
         path.rename(lab / "night" / path.name)
     pixel = {"file": "night/one.mueller.h5", "x0": 3, "y0": 2}
-    there = client.get("/probe", params=pixel).json()
-    assert "fit" in there, there["told"]
+    probe = client.get("/probe", params=pixel).json()
+    assert "fit" in probe, probe["told"]
     page = client.get("/product", params={"file": "night/one.mueller.h5"}).text
     assert re.search(r'capture\s+<a href="[^"]*capture\?file=night', page)
     # Another capture of the same name and size is not its source.

@@ -35,8 +35,8 @@ def test_a_region_is_kept_in_a_file_and_carried_to_other_images(lab, client, drr
     drr_capture("larger.h5", shape=(24, 32))
     drr_capture("other.h5", shape=(12, 20))
     assert keep(client).status_code == 200
-    (kept,) = json.loads((lab / ".umov-view/regions.json").read_text())["regions"]
-    assert kept == {"name": "spot", "columns": [2, 10], "rows": [3, 8], "image": [12, 16]}
+    (region,) = json.loads((lab / ".umov-view/regions.json").read_text())["regions"]
+    assert region == {"name": "spot", "columns": [2, 10], "rows": [3, 8], "image": [12, 16]}
     assert regions(client, file="two.h5")["spot"]["where"] == "columns 2 to 9, rows 3 to 7 (40 pixels)"
     # The same place on an image of twice the pixels; none where the images have another form.
     assert regions(client, file="larger.h5")["spot"]["where"] == "columns 4 to 19, rows 6 to 15 (160 pixels)"
@@ -88,7 +88,7 @@ def test_a_region_of_a_matrix_is_the_mean_that_the_command_gives(client, configs
     text = (configs / "instruments/rgb950.yaml").read_text().replace("662: 127.12", "662: {value: 127.12, u: 0.3}")
     product = Reduction(drr_capture("one.h5", instrument_yaml=text)).make()
     keep(client)
-    means = {one.name: one for one in mean_of([product], PART)}
+    means = {mean.name: mean for mean in mean_of([product], PART)}
     with Product(product) as opened:
         m = opened.get("mueller").reshape(16, 12, 16)
     for query, name, values in (

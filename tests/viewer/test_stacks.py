@@ -35,30 +35,30 @@ def night(drr_capture, client):
 
 
 def test_a_point_is_the_mean_that_the_command_gives(night, client, lab):
-    asked = {"kind": "mueller", "name": "mueller", "index": 5, "region": "spot", "label": "m11 over m00"}
-    found = client.get("/stacked", params=asked).json()
-    assert found["left_out"] == {}
-    assert [(point["sample"], point["omega"]) for point in found["points"]] == [
+    query = {"kind": "mueller", "name": "mueller", "index": 5, "region": "spot", "label": "m11 over m00"}
+    stack = client.get("/stacked", params=query).json()
+    assert stack["left_out"] == {}
+    assert [(point["sample"], point["omega"]) for point in stack["points"]] == [
         *(("red", omega) for omega in (35.0, 60.0, 110.0)),
         *(("white", omega) for omega in (35.0, 60.0, 110.0)),
     ]
-    for point in found["points"]:
-        (mean,) = (one for one in mean_of([lab / point["file"]], PART) if one.name == "m11_over_m00")
+    for point in stack["points"]:
+        (mean,) = (value for value in mean_of([lab / point["file"]], PART) if value.name == "m11_over_m00")
         assert (point["value"], point["error"]) == (pytest.approx(mean.value), pytest.approx(mean.u_noise))
         assert point["time"]
-    assert len(client.get("/stacked", params=asked | {"q": "white 60"}).json()["points"]) == 1
-    text = client.get("/stack.csv", params=asked).text
+    assert len(client.get("/stacked", params=query | {"q": "white 60"}).json()["points"]) == 1
+    text = client.get("/stack.csv", params=query).text
     assert text.startswith("# SIMULATED data\n")
     lines = list(csv.DictReader(text.splitlines()[1:]))
-    assert [float(line["value"]) for line in lines] == [point["value"] for point in found["points"]]
+    assert [float(line["value"]) for line in lines] == [point["value"] for point in stack["points"]]
     assert {line["region"] for line in lines} == {"spot"}
-    assert client.get("/stacked", params=asked | {"region": "gone"}).status_code == 404
+    assert client.get("/stacked", params=query | {"region": "gone"}).status_code == 404
 
 
 def test_the_notebook_has_the_same_numbers(night, client, lab):
     stack = follow_region(lab, "3:8,2:10").sel(quantity="m11_over_m00")
-    asked = {"kind": "mueller", "name": "mueller", "index": 5, "region": "spot"}
-    points = {lab / point["file"]: point for point in client.get("/stacked", params=asked).json()["points"]}
+    query = {"kind": "mueller", "name": "mueller", "index": 5, "region": "spot"}
+    points = {lab / point["file"]: point for point in client.get("/stacked", params=query).json()["points"]}
     for file, value, u, omega in zip(*(stack[n].values for n in ("file", "value", "u_noise", "omega")), strict=True):
         point = points[lab / file]
         assert (point["value"], point["error"], point["omega"]) == (pytest.approx(value), pytest.approx(u), omega)
@@ -67,11 +67,11 @@ def test_the_notebook_has_the_same_numbers(night, client, lab):
 
 def test_images_of_another_form_and_other_quantities_are_left_out_with_the_reason(night, client, drr_capture):
     Reduction(drr_capture("wide.h5", shape=(12, 20), omega_deg=20.0)).make()
-    asked = {"kind": "mueller", "name": "mueller", "index": 5, "region": "spot"}
-    found = client.get("/stacked", params=asked).json()
-    assert (len(found["points"]), list(found["left_out"].values())) == (6, [1])
+    query = {"kind": "mueller", "name": "mueller", "index": 5, "region": "spot"}
+    stack = client.get("/stacked", params=query).json()
+    assert (len(stack["points"]), list(stack["left_out"].values())) == (6, [1])
     # The middle half is there in every image.
-    assert len(client.get("/stacked", params=asked | {"region": "middle half of the image"}).json()["points"]) == 7
+    assert len(client.get("/stacked", params=query | {"region": "middle half of the image"}).json()["points"]) == 7
 
 
 def test_a_folder_without_products_says_how_to_make_them(client, drr_capture):
