@@ -21,9 +21,9 @@ def served(kind: str, speed: float = 20.0, **options: Any) -> Iterator[tuple[Emu
         yield emulator, port.path
 
 
-def wait_until(what: str, condition: Callable[[], bool], allowed_s: float = 8.0) -> None:
+def wait_until(state: str, condition: Callable[[], bool], allowed_s: float = 8.0) -> None:
     give_up_s = time.monotonic() + allowed_s
     while not condition():
         if time.monotonic() > give_up_s:
-            pytest.fail(f"not within {allowed_s} s: {what}")
+            pytest.fail(f"not within {allowed_s} s: {state}")
         time.sleep(0.01)

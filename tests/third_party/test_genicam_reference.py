@@ -23,5 +23,5 @@ def test_the_reference_implementation_reads_it(name: str) -> None:
 
     nodes = NodeMap()
     nodes.load_xml_from_string(TEXTS[name])
-    found = {feature.node.name for feature in nodes.Root.features}
-    assert {"Width", "PixelFormat", "TriggerMode", "PayloadSize"} <= found
+    features = {feature.node.name for feature in nodes.Root.features}
+    assert {"Width", "PixelFormat", "TriggerMode", "PayloadSize"} <= features

@@ -31,8 +31,8 @@ def shift(request: pytest.FixtureRequest) -> Iterator[int]:
     with GigeCamera("SN1", 64, 48, lambda _: COUNTS, description=request.param):
         with aravis.open("camera", aravis.Config(device="127.0.0.1", chunk_timestamp=False)) as camera:
             camera.configure(CameraSettings(exposure_s=0.01))
-            found = camera.describe().shift
-        yield found
+            bits = camera.describe().shift
+        yield bits
 
 
 def assert_are_the_counts(payload: bytes, shift: int) -> None:
@@ -45,8 +45,8 @@ def assert_are_the_counts(payload: bytes, shift: int) -> None:
 def test_viva_genicam_drives_a_simulated_camera(shift: int) -> None:
     import viva_genicam
 
-    (found,) = viva_genicam.discover(all=True)
-    with viva_genicam.connect_gige(found) as camera:
+    (device,) = viva_genicam.discover(all=True)
+    with viva_genicam.connect_gige(device) as camera:
         assert not camera.skipped()
         assert camera.get_integer("Width") == 64
         with camera.stream() as frames:
@@ -118,15 +118,15 @@ def beyond_a_cable() -> Iterator[None]:
     with subprocess.Popen(["unshare", "--net", "sleep", "60"]) as far:
         try:
             time.sleep(0.3)
-            there = ("nsenter", "--target", str(far.pid), "--net")
+            namespace = ("nsenter", "--target", str(far.pid), "--net")
             run("ip", "link", "add", "near", "type", "veth", "peer", "name", "far")
             run("ip", "link", "set", "far", "netns", str(far.pid))
             run("ip", "addr", "add", "10.9.0.1/24", "dev", "near")
             run("ip", "link", "set", "near", "up")
-            run(*there, "ip", "addr", "add", "10.9.0.2/24", "dev", "far")
-            run(*there, "ip", "link", "set", "far", "up")
-            run(*there, "ip", "link", "set", "lo", "up")
-            with subprocess.Popen([*there, sys.executable, "-c", CAMERA], stdout=subprocess.PIPE) as camera:
+            run(*namespace, "ip", "addr", "add", "10.9.0.2/24", "dev", "far")
+            run(*namespace, "ip", "link", "set", "far", "up")
+            run(*namespace, "ip", "link", "set", "lo", "up")
+            with subprocess.Popen([*namespace, sys.executable, "-c", CAMERA], stdout=subprocess.PIPE) as camera:
                 assert camera.stdout is not None
                 assert camera.stdout.readline() == b"ready\n"
                 try:
@@ -141,8 +141,8 @@ def test_a_camera_beyond_a_cable_is_found_by_broadcast(beyond_a_cable: None) -> 
     import telegenic
     import viva_genicam
 
-    assert [found.ip for found in viva_genicam.discover()] == ["10.9.0.2"]
-    assert [found.serial for found in telegenic.discover()] == ["SN1"]
+    assert [device.ip for device in viva_genicam.discover()] == ["10.9.0.2"]
+    assert [device.serial for device in telegenic.discover()] == ["SN1"]
     with aravis.open("camera", aravis.Config(device="SN1")) as camera:
         assert (camera.describe().interface, camera.describe().interface_mtu) == ("near", 1500)
         camera.configure(CameraSettings(exposure_s=0.01))

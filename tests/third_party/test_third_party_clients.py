@@ -293,8 +293,8 @@ def test_libximc(monkeypatch: pytest.MonkeyPatch) -> None:
             names = [name for name in dir(stage) if re.fullmatch(r"get_\w+_settings|get_controller_name", name)]
             assert len(names) >= 15
             for name in names:
-                kept = getattr(stage, name)()
-                getattr(stage, f"set_{name[4:]}")(kept)
+                value = getattr(stage, name)()
+                getattr(stage, f"set_{name[4:]}")(value)
             power = stage.get_power_settings()
             power.HoldCurrent = 42
             stage.set_power_settings(power)
