@@ -30,7 +30,7 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
 
 def test_every_device_tells_who_it_is(rig: Rig) -> None:
     identities = [axis.describe() for axis in rig.axes.values()]
-    assert len({(one.port, one.address) for one in identities}) == len(identities)
+    assert len({(identity.port, identity.address) for identity in identities}) == len(identities)
     assert rig.camera is not None
     assert rig.camera.describe().model
 
