@@ -68,11 +68,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     from the end. A long test there would be the last to run, with nothing beside it.
     """
     long = [item for item in items if item.get_closest_marker("long")]
-    others = [item for item in items if not item.get_closest_marker("long")]
+    short = [item for item in items if not item.get_closest_marker("long")]
     if not config.option.all:
         config.stash[LEFT_OUT] = len(long)
         config.hook.pytest_deselected(items=long)
-        items[:] = others
+        items[:] = short
         return
     processes = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if processes == 1:
@@ -81,9 +81,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for n in range(processes):
         first = long[n::processes]
         count = (len(items) - len(dealt)) // (processes - n) - len(first)
-        dealt += first + others[: max(count, 0)]
-        del others[: max(count, 0)]
-    items[:] = dealt + others
+        dealt += first + short[: max(count, 0)]
+        del short[: max(count, 0)]
+    items[:] = dealt + short
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
@@ -113,17 +113,17 @@ def public_files() -> Callable[[str], dict[str, Path]]:
     """
     from processing.public_data.sets import SHIPPED, find_files
 
-    other = Path(os.environ.get("UMOV_DATA", ROOT.parent / "shared" / "data"))
+    data = Path(os.environ.get("UMOV_DATA", ROOT.parent / "shared" / "data"))
 
     @cache
     def files(name: str) -> dict[str, Path]:
-        found = find_files(name, [SHIPPED, other])
-        if found is None:
-            message = f"the data set {name} is not in {other}; get it: ./lab data get {name}, UMOV_DATA=data"
+        set_files = find_files(name, [SHIPPED, data])
+        if set_files is None:
+            message = f"the data set {name} is not in {data}; get it: ./lab data get {name}, UMOV_DATA=data"
             if os.environ.get("CI"):
                 pytest.fail(message)
             pytest.skip(message)
-        return found
+        return set_files
 
     return files
 

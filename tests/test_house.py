@@ -24,17 +24,17 @@ def imports(root: Path) -> dict[str, set[str]]:
         for package in PACKAGES
         for f in (root / package).rglob("*.py")
     }
-    found = {}
+    edges = {}
     for module, file in files.items():
         targets = set()
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and node.module:
-                whole = (f"{node.module}.{alias.name}" for alias in node.names)
-                targets |= {name if name in files else node.module for name in whole}
+                names = (f"{node.module}.{alias.name}" for alias in node.names)
+                targets |= {name if name in files else node.module for name in names}
             elif isinstance(node, ast.Import):
                 targets |= {alias.name for alias in node.names}
-        found[module] = {t for t in targets if t in files and t != module}
-    return found
+        edges[module] = {t for t in targets if t in files and t != module}
+    return edges
 
 
 #: A kit asks these names of each module of a kind.
@@ -42,13 +42,13 @@ OF_EACH_KIND = {"Config", "Constants", "Model"}
 
 
 def test_one_class_name_is_one_class():
-    found: dict[str, list[str]] = {}
+    places: dict[str, list[str]] = {}
     for package in PACKAGES:
         for file in (ROOT / package).rglob("*.py"):
             for node in ast.parse(file.read_text(encoding="utf-8")).body:
                 if isinstance(node, ast.ClassDef) and node.name not in OF_EACH_KIND:
-                    found.setdefault(node.name, []).append(str(file.relative_to(ROOT)))
-    assert {name: files for name, files in found.items() if len(files) > 1} == {}
+                    places.setdefault(node.name, []).append(str(file.relative_to(ROOT)))
+    assert {name: files for name, files in places.items() if len(files) > 1} == {}
 
 
 def test_no_circle_of_imports():
@@ -85,62 +85,62 @@ def two_tests(tmp_path):
 
 @pytest.mark.parametrize("options", [(), ("-n", "2")])
 def test_long_tests_are_left_out_with_a_line(two_tests, options):
-    said = two_tests(*options)
-    assert "1 passed" in said
-    assert "1 long tests left out; run them too: ./lab test --all" in said
+    output = two_tests(*options)
+    assert "1 passed" in output
+    assert "1 long tests left out; run them too: ./lab test --all" in output
 
 
 @pytest.mark.parametrize("options", [("--all", "-n", "2"), ("tests/test_two.py",), ("-k", "test"), ("-m", "not other")])
 def test_what_is_selected_runs_although_it_is_long(two_tests, options):
-    said = two_tests(*options)
-    assert "2 passed" in said
-    assert "left out" not in said
+    output = two_tests(*options)
+    assert "2 passed" in output
+    assert "left out" not in output
 
 
 def test_the_floors_on_the_page_are_those_of_the_contracts():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     contracts = project["tool"]["importlinter"]["contracts"]
-    kept = {contract["containers"][0]: " > ".join(contract["layers"]) for contract in contracts[1:]}
+    floors_of_rooms = {contract["containers"][0]: " > ".join(contract["layers"]) for contract in contracts[1:]}
     page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
     shown = re.findall(r"^([\w.]+):  +(.+?)(?=^[\w.]+: |^```)", page, re.M | re.S)
-    assert {room: " ".join(floors.split()) for room, floors in shown} == kept
+    assert {room: " ".join(floors.split()) for room, floors in shown} == floors_of_rooms
 
 
 def cited_outside(text: str) -> list[str]:
     """What a text cites that is not in the repository: papers of the workshop, pages of docs/ that are not there."""
-    found = re.findall(r"shared/\w+\.(?:md|tex)|\b[Tt]raps? \d+", text)
+    citations = re.findall(r"shared/\w+\.(?:md|tex)|\b[Tt]raps? \d+", text)
     for page, heading in re.findall(r"docs/([\w/-]+\.md)(?:, \"([^\"]+)\")?", text):
         file = ROOT / "docs" / page
         if not file.exists():
-            found.append(f"docs/{page}")
+            citations.append(f"docs/{page}")
         elif heading and not re.search(rf"^#+ .*{re.escape(' '.join(heading.split()))}", file.read_text(), re.M):
-            found.append(f'docs/{page}, "{heading}"')
-    return found
+            citations.append(f'docs/{page}, "{heading}"')
+    return citations
 
 
 def test_every_picture_is_on_a_page_and_has_its_command():
     images = ROOT / "docs/images"
-    there = {str(f.relative_to(images)) for ending in ("png", "svg") for f in images.rglob(f"*.{ending}")}
+    pictures = {str(f.relative_to(images)) for ending in ("png", "svg") for f in images.rglob(f"*.{ending}")}
     pages = "".join(f.read_text(encoding="utf-8") for f in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md")))
-    assert {name for name in there if f"images/{name})" not in pages} == set()
+    assert {name for name in pictures if f"images/{name})" not in pages} == set()
     table = (ROOT / "docs/testing.md").read_text(encoding="utf-8").split("## Pictures")[1].split("## ")[0]
     for names, command, run in (line.split("|")[1:4] for line in table.splitlines() if line.startswith("| `")):
         for pattern in re.findall("`(.+?)`", names):
-            named = {name for name in there if fnmatch(name, pattern)}
+            named = {name for name in pictures if fnmatch(name, pattern)}
             assert named, pattern
-            there -= named
+            pictures -= named
         for file in re.findall(r"[\w/]+\.py", command + run):
             assert list(ROOT.glob(f"tests/*/{file}")) or (ROOT / file).exists(), file
-    assert there == set()
+    assert pictures == set()
 
 
 @pytest.mark.parametrize("folder", [*PACKAGES, "tests", "benchmarks", "configs", "docs"])
 def test_nothing_cites_what_is_not_here(folder):
     files = [f for ending in ("py", "md", "yaml") for f in sorted((ROOT / folder).rglob(f"*.{ending}"))]
     assert files
-    here = Path(__file__)
-    wrong = {str(f.relative_to(ROOT)): cited_outside(f.read_text(encoding="utf-8")) for f in files if f != here}
-    assert {name: what for name, what in wrong.items() if what} == {}
+    this = Path(__file__)
+    wrong = {str(f.relative_to(ROOT)): cited_outside(f.read_text(encoding="utf-8")) for f in files if f != this}
+    assert {name: citations for name, citations in wrong.items() if citations} == {}
 
 
 def test_a_citation_that_leads_outside_is_seen():
@@ -201,22 +201,22 @@ def test_every_page_of_the_docs_is_in_the_site():
 )
 def test_what_a_page_does_against_the_language_is_seen(text, mistake):
     prose = runpy.run_path(str(ROOT / ".ci/prose.py"))
-    found = prose["mistakes"]("docs/page.md", text)
-    assert any(mistake in line for line in found)
+    mistakes = prose["mistakes"]("docs/page.md", text)
+    assert any(mistake in line for line in mistakes)
     spared = "# " + "Title " * 40 + "\n\n*Reference.* One sentence.\n\n| " + "cell " * 40 + "|\n|---|\n"
     assert not prose["mistakes"]("docs/page.md", spared)
 
 
 def _kinds_by_name(folder: Path) -> list[str]:
     """Where the kind of an effect or candidate is compared with a string."""
-    found = []
+    lines = []
     for path in sorted(folder.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             sides = [node.left, *node.comparators] if isinstance(node, ast.Compare) else []
             kind = any(isinstance(side, ast.Attribute) and side.attr == "kind" for side in sides)
             if kind and any(isinstance(side, ast.Constant) and isinstance(side.value, str) for side in sides):
-                found.append(f"{path.name}:{node.lineno}")
-    return found
+                lines.append(f"{path.name}:{node.lineno}")
+    return lines
 
 
 @pytest.mark.parametrize("room", ["search", "instrument", "surface"])
