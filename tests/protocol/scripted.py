@@ -4,8 +4,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from drivers.serial_link import LineRegistry
 from simulators.clock import patient_clock
-from simulators.serial.pty_port import PtyPort
+from simulators.serial.pty_port import PtyPort, SerialEmulator
 
 
 class Script:
@@ -32,10 +33,18 @@ class Script:
 
 
 @contextmanager
-def scripted(*pairs: tuple[bytes, bytes]) -> Iterator[str]:
+def served(device: SerialEmulator) -> Iterator[tuple[str, LineRegistry]]:
+    """The port of a device, and the lines to open it with."""
+    with PtyPort(device) as port, LineRegistry(clock=patient_clock()) as lines:
+        yield port.path, lines
+
+
+@contextmanager
+def scripted(*pairs: tuple[bytes, bytes]) -> Iterator[tuple[str, LineRegistry]]:
+    """The port of a device that plays `pairs`, and the lines to open it with; a pair that is not used fails."""
     script = Script(list(pairs))
-    with PtyPort(script) as port:
-        yield port.path
+    with served(script) as opened:
+        yield opened
         give_up_s = patient_clock().now_s() + 1.0
         while script.pairs and patient_clock().now_s() < give_up_s:
             time.sleep(0.01)

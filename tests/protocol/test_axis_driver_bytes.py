@@ -7,12 +7,11 @@ from hypothesis import strategies as st
 from drivers.apt_frames import apt_framer
 from drivers.axes import apt, esp301, gcs2, gsc, lcc25, smc100, zaber
 from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
-from drivers.serial_link import LONGEST_FRAME, LineRegistry, line_framer
+from drivers.serial_link import LONGEST_FRAME, line_framer
 from simulators.clock import FastClock, patient_clock
 from simulators.controllers import esp301 as esp301_emulator
-from simulators.serial.pty_port import PtyPort
 from simulators.serial.serve_options import ServeOptions
-from tests.protocol.scripted import scripted
+from tests.protocol.scripted import scripted, served
 
 
 def test_gsc_moves_are_relative_and_asked_for() -> None:
@@ -20,19 +19,16 @@ def test_gsc_moves_are_relative_and_asked_for() -> None:
         (b"Q:\r\n", b"-      400,       20,K,K,R\r\n"),
         (b"Q:\r\n", b"OK\r\n-      400,       20,K,K,B\r\n"),
     )
-    with (
-        scripted(
-            (b"?:V\r\n", b"V1.10\r\n"),
-            idle,
-            *[idle] * 8,
-            (b"M:1+P1200\r\n", b""),
-            accepted,
-            (b"G:\r\n", b""),
-            (b"Q:\r\n", b"-      400,       20,X,L,R\r\n"),
-            (b"L:1\r\n", b""),
-        ) as path,
-        LineRegistry(clock=patient_clock()) as lines,
-    ):
+    with scripted(
+        (b"?:V\r\n", b"V1.10\r\n"),
+        idle,
+        *[idle] * 8,
+        (b"M:1+P1200\r\n", b""),
+        accepted,
+        (b"G:\r\n", b""),
+        (b"Q:\r\n", b"-      400,       20,X,L,R\r\n"),
+        (b"L:1\r\n", b""),
+    ) as (path, lines):
         axis = gsc.open("psg", gsc.Config(port=path, assume_homed=True, rtscts=False), lines)
         assert (axis.read_position().deg, axis.is_homed()) == (-1.0, True)
         with pytest.raises(CommandRejected, match="G:: the controller refuses it"):
@@ -45,49 +41,40 @@ def test_gsc_moves_are_relative_and_asked_for() -> None:
 def test_a_gsc_02_is_driven_by_a_letter_without_a_colon() -> None:
     # Blanks as the manuals print them.
     idle = (b"Q:\r\n", b"-       400,         0, K, K, R\r\n")
-    with (
-        scripted((b"?:V\r\n", b"V2.00\r\n"), *[idle] * 3, (b"M:1+P1200\r\n", b""), idle, (b"G\r\n", b""), idle) as path,
-        LineRegistry(clock=patient_clock()) as lines,
+    with scripted((b"?:V\r\n", b"V2.00\r\n"), *[idle] * 3, (b"M:1+P1200\r\n", b""), idle, (b"G\r\n", b""), idle) as (
+        path,
+        lines,
     ):
         axis = gsc.open("psg", gsc.Config(port=path, home_direction="-", assume_homed=True, rtscts=False), lines)
         axis._do_start_move(800.0)
 
 
 def test_a_disturbed_blank_in_a_status_of_a_gsc_is_asked_for_again() -> None:
-    with (
-        scripted(
-            (b"?:V\r\n", b"V1.10\r\n"),
-            (b"Q:\r\n", b"-\x1c     400,K,K,R\r\n"),
-            (b"Q:\r\n", b"-      400,K,K,R\r\n"),
-        ) as path,
-        LineRegistry(clock=patient_clock()) as lines,
-    ):
+    with scripted(
+        (b"?:V\r\n", b"V1.10\r\n"),
+        (b"Q:\r\n", b"-\x1c     400,K,K,R\r\n"),
+        (b"Q:\r\n", b"-      400,K,K,R\r\n"),
+    ) as (path, lines):
         gsc.open("psg", gsc.Config(port=path, rtscts=False, reply_s=0.2), lines)
 
 
 def test_an_lcc25_is_woken_by_an_empty_line() -> None:
-    with (
-        scripted(
-            (b"\r", b"\rCommand error CMD_NOT_DEFINED\r>\n"),
-            (b"*idn?\r", b"*idn?\rTHORLABS LCC25 VERSION 1.05\r>\n"),
-            (b"volt1=1.5300\r", b"volt1=1.5300\r>\n"),
-            (b"mode=1\r", b"mode=1\r>\n"),
-            (b"enable=1\r", b"enable=1\r>\n"),
-        ) as path,
-        LineRegistry(clock=patient_clock()) as lines,
-    ):
+    with scripted(
+        (b"\r", b"\rCommand error CMD_NOT_DEFINED\r>\n"),
+        (b"*idn?\r", b"*idn?\rTHORLABS LCC25 VERSION 1.05\r>\n"),
+        (b"volt1=1.5300\r", b"volt1=1.5300\r>\n"),
+        (b"mode=1\r", b"mode=1\r>\n"),
+        (b"enable=1\r", b"enable=1\r>\n"),
+    ) as (path, lines):
         lcc25.open("lcr", lcc25.Config(port=path), lines)._do_start_move(1.53)
 
 
 def test_the_speed_of_a_conex_agp_is_that_of_the_rig_file() -> None:
-    with (
-        scripted(
-            *[(b"1VE\r\n", b"1VE CONEX-AGP 2.0.0\r\n"), (b"1ID?\r\n", b"1IDAG-PR100P\r\n")] * 2,
-            *[(b"1SL?\r\n", b"1SL-170\r\n")] * 2,
-            *[(b"1SR?\r\n", b"1SR170\r\n")] * 2,
-        ) as path,
-        LineRegistry(clock=patient_clock()) as lines,
-    ):
+    with scripted(
+        *[(b"1VE\r\n", b"1VE CONEX-AGP 2.0.0\r\n"), (b"1ID?\r\n", b"1IDAG-PR100P\r\n")] * 2,
+        *[(b"1SL?\r\n", b"1SL-170\r\n")] * 2,
+        *[(b"1SR?\r\n", b"1SR170\r\n")] * 2,
+    ) as (path, lines):
         with pytest.raises(WrongDevice, match="speed_deg_s"):
             smc100.open("psg", smc100.Config(port=path), lines)
         axis = smc100.open("psg", smc100.Config(port=path, speed_deg_s=2.0), lines)
@@ -114,7 +101,7 @@ def test_smc100_open_and_refusals() -> None:
         (b"1ST\r\n", b""),
         (b"1TS\r\n", b"1TS010033\r\n"),
     )
-    with scripted(*pairs) as path, LineRegistry(clock=patient_clock()) as lines:
+    with scripted(*pairs) as (path, lines):
         arm = smc100.open("arm", smc100.Config(port=path, stage_id="PR50"), lines)
         assert arm.describe().firmware == "2.0.1"
         assert (arm.speed_deg_s, arm.acceleration_deg_s2, arm.limits.max_deg) == (20.0, 80.0, 90.0)
@@ -128,18 +115,12 @@ def test_smc100_open_and_refusals() -> None:
 
 def test_smc100_asks_again_for_a_state_that_there_is_not() -> None:
     # 0x29 is no state: a reply of the right form with one digit changed.
-    with (
-        scripted(*smc100_after((b"1TS\r\n", b"1TS000029\r\n"), (b"1TS\r\n", b"1TS000028\r\n"))) as path,
-        LineRegistry(clock=patient_clock()) as lines,
-    ):
+    with scripted(*smc100_after((b"1TS\r\n", b"1TS000029\r\n"), (b"1TS\r\n", b"1TS000028\r\n"))) as (path, lines):
         assert smc100.open("arm", smc100.Config(port=path), lines).is_moving()
 
 
 def test_smc100_does_not_guess_a_state_that_stays_unknown() -> None:
-    with (
-        scripted(*smc100_after((b"1TS\r\n", b"1TS000029\r\n"), (b"1TS\r\n", b"1TS000029\r\n"))) as path,
-        LineRegistry(clock=patient_clock()) as lines,
-    ):
+    with scripted(*smc100_after((b"1TS\r\n", b"1TS000029\r\n"), (b"1TS\r\n", b"1TS000029\r\n"))) as (path, lines):
         arm = smc100.open("arm", smc100.Config(port=path), lines)
         with pytest.raises(ReplyError, match="unknown state 000029"):
             arm.is_moving()
@@ -162,7 +143,7 @@ def test_apt_bytes() -> None:
         (bytes.fromhex("110401005001"), position),
         (bytes.fromhex("650401025001"), b""),
     ]
-    with scripted(*pairs) as path, LineRegistry(clock=patient_clock()) as lines:
+    with scripted(*pairs) as (path, lines):
         axis = apt.open("psa", apt.Config(port=path, serial_number=27_000_001), lines)
         assert axis.speed_deg_s == pytest.approx(345_522 / 42941.66, rel=1e-4)
         assert axis.read_position().counts == -8
@@ -200,7 +181,7 @@ def test_esp301_bytes() -> None:
         (b"TE?\r", b"213\r\n"),
         (b"TE?\r", b"0\r\n"),
     ]
-    with scripted(*opening) as path, LineRegistry(clock=patient_clock()) as lines:
+    with scripted(*opening) as (path, lines):
         axis = esp301.open("arm", esp301.Config(port=path, axis=2, stage_id="URS75CC, SN1263"), lines)
         assert axis.describe().serial_number == "SN1263"
         assert axis.read_position().counts == 30.0
@@ -228,7 +209,7 @@ def test_gcs2_bytes() -> None:
         (b"MOV 2 12.500000\n", b""),
         (b"ERR?\n", b"7\n"),
     ]
-    with scripted(*opening) as path, LineRegistry(clock=patient_clock()) as lines:
+    with scripted(*opening) as (path, lines):
         axis = gcs2.open("psg", gcs2.Config(port=path, axis=2, serial_number="0115012345"), lines)
         assert (axis.limits.min_deg, axis.limits.max_deg) == (None, 180.0)
         assert axis.read_position().counts == 30.25
@@ -249,7 +230,7 @@ def test_readings_that_disagree_are_no_position() -> None:
         (b"1ID?\r\n", b"1IDX\r\n"),
         *[(f"1{c}?\r\n".encode(), f"1{c}20\r\n".encode()) for c in ("VA", "VA", "AC", "AC", "SL", "SL", "SR", "SR")],
     ]
-    with scripted(*opening, *steps) as path, LineRegistry(clock=patient_clock()) as lines:
+    with scripted(*opening, *steps) as (path, lines):
         arm = smc100.open("arm", smc100.Config(port=path), lines)
         with pytest.raises(ReplyError, match="contradict"):
             arm.read_position()
@@ -283,8 +264,8 @@ def test_what_a_pi_controller_says_of_itself(answer: str, identity: tuple[str, s
 
 def test_errors_of_one_esp301_axis_are_kept_while_another_is_asked() -> None:
     emulator = esp301_emulator.make(ServeOptions(clock=FastClock(100.0, base=patient_clock())))
-    with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
-        first, second = (esp301.open(f"axis {k}", esp301.Config(port=port.path, axis=k), lines) for k in (1, 2))
+    with served(emulator) as (path, lines):
+        first, second = (esp301.open(f"axis {k}", esp301.Config(port=path, axis=k), lines) for k in (1, 2))
         emulator.errors.extend([(204, 0), (7, 0), (120, 0)])
         with pytest.raises(CommandRejected, match=r"error 7: .*, error 120: homing aborted"):
             first.check_fault()

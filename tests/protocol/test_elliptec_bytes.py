@@ -4,13 +4,11 @@ import pytest
 
 from drivers.axes import elliptec
 from drivers.errors import CommandRejected
-from drivers.serial_link import LineRegistry
 from simulators.clock import FastClock, patient_clock
 from simulators.controllers import elliptec as elliptec_emulator
-from simulators.serial.pty_port import PtyPort
 from simulators.serial.reply_faults import Fault
 from simulators.serial.serve_options import ServeOptions
-from tests.protocol.scripted import scripted
+from tests.protocol.scripted import scripted, served
 
 
 def elliptec_after(*pairs: tuple[bytes, bytes]) -> list[tuple[bytes, bytes]]:
@@ -23,7 +21,7 @@ def test_elliptec_real_captures() -> None:
     # The position, too, is a recording of a real mount.
     position = (b"0gp", b"0POFFFFDA9C\r\n")
     pairs = elliptec_after(position, position, (b"0gs", b"0GS09\r\n"), (b"0gs", b"0GS0D\r\n"))
-    with scripted(*pairs) as path, LineRegistry(clock=patient_clock()) as lines:
+    with scripted(*pairs) as (path, lines):
         axis = elliptec.open("psg", elliptec.Config(port=path, address="0", serial_number="11400509"), lines)
         assert axis.counts_per_deg == pytest.approx(398.22, abs=0.01)
         position = axis.read_position()
@@ -40,9 +38,9 @@ def test_a_module_that_answers_late_is_found_by_its_serial_number() -> None:
     serial_number = elliptec_emulator.axis_configs(emulator, "none")[0].serial_number
     # Of the two readings of its identity the first or the second.
     for place in (1, 2):
-        with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
+        with served(emulator) as (path, lines):
             emulator.faults.add(Fault("late", from_command=place, commands=1, amount=0.13))
-            config = elliptec.Config(port=port.path, serial_number=serial_number, reply_s=0.1)
+            config = elliptec.Config(port=path, serial_number=serial_number, reply_s=0.1)
             assert elliptec.open("psg", config, lines).describe().serial_number == serial_number
 
 
@@ -57,7 +55,7 @@ def test_elliptec_end_message_just_before_the_status_still_proves_the_homing() -
         (b"0gs", b"0GS00\r\n"),
         *[(b"0gp", b"0PO00000000\r\n")] * 2,
     )
-    with scripted(*pairs) as path, LineRegistry(clock=patient_clock()) as lines:
+    with scripted(*pairs) as (path, lines):
         config = elliptec.Config(port=path, address="0", pause_before_move_s=0.0)
         axis = elliptec.open("psg", config, lines)
         assert axis.home().wait().counts == 0
@@ -79,7 +77,7 @@ def test_the_status_that_answers_a_stop_of_an_elliptec_is_no_answer_to_a_questio
         (b"0gs", b"0GS09\r\n"),
         (b"0gs", b"0GS09\r\n"),
     )
-    with scripted(*pairs) as path, LineRegistry(clock=patient_clock()) as lines:
+    with scripted(*pairs) as (path, lines):
         axis = elliptec.open("psg", elliptec.Config(port=path, address="0", reply_s=0.2), lines)
         axis.stop()
         assert axis.read_position().counts == 0

@@ -8,13 +8,12 @@ import pytest
 
 from drivers.axes import standa
 from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
-from drivers.serial_link import LineRegistry
 from drivers.standa_frames import LAYOUTS, framer, message
 from simulators.clock import FastClock, ManualClock, patient_clock
 from simulators.controllers import standa as emulated
 from simulators.controllers.standa import StandaEmulator
-from simulators.serial.pty_port import PtyPort
 from simulators.serial.serve_options import ServeOptions
+from tests.protocol.scripted import served
 
 # libximc 3.1.2, command_move(-1234, -56): it fills the bytes that it reserves with 0xCC.
 MOVE = bytes.fromhex("6d6f7665 2efbffff c8ff cccccccccccc f355")
@@ -26,8 +25,8 @@ BORDERS = bytes.fromhex("73656473 06 01 9cffffff fdff c8000000 0700 cccccccccccc
 def opened(homed: bool = True, **options: Any) -> Iterator[tuple[StandaEmulator, standa.StandaAxis]]:
     clock = FastClock(200.0, base=patient_clock())
     emulator = emulated.make(ServeOptions(**{"homed": homed, "clock": clock} | options))
-    with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
-        entry = {"port": port.path, "steps_per_deg": 100, "poll_s": 0.002, "reply_s": 0.25, "assume_homed": homed}
+    with served(emulator) as (path, lines):
+        entry = {"port": path, "steps_per_deg": 100, "poll_s": 0.002, "reply_s": 0.25, "assume_homed": homed}
         yield emulator, standa.open("psg", standa.Config.model_validate(entry), lines)
 
 
@@ -64,8 +63,8 @@ def test_answers_are_found_in_noise() -> None:
 def test_opening_reads_units_and_borders() -> None:
     emulator = emulated.make(ServeOptions(clock=FastClock(200.0, base=patient_clock())))
     emulator.settings |= {b"eds": (5, 6, -2100, 0, 32100, 128), b"mov": (2000, 128, 3000, 5000, 2000, 0)}
-    with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
-        axis = standa.open("psg", standa.Config(port=port.path, steps_per_deg=100), lines)
+    with served(emulator) as (path, lines):
+        axis = standa.open("psg", standa.Config(port=path, steps_per_deg=100), lines)
         # The border on the left does not stop.
         assert (axis.limits.min_deg, axis.limits.max_deg) == (None, 321.005)
         assert (axis.speed_deg_s, axis.acceleration_deg_s2) == (20.005, 30.0)
@@ -73,7 +72,7 @@ def test_opening_reads_units_and_borders() -> None:
         assert (axis.describe().model, axis.describe().firmware) == ("8SMC5-US 2.3.0", "4.7.8")
         emulator.settings[b"fbs"] = (4000, 1, 0, 4000)
         with pytest.raises(WrongDevice, match="feedback 1"):
-            standa.open("psg", standa.Config(port=port.path, steps_per_deg=100), lines)
+            standa.open("psg", standa.Config(port=path, steps_per_deg=100), lines)
 
 
 def test_home_gives_the_count_a_zero_and_needs_both_the_flag_and_this_session() -> None:
