@@ -18,6 +18,8 @@ import matplotlib.figure  # noqa: F401
 import numpy as np
 import pytest
 
+from tests.commands import exit_code
+
 ROOT = Path(__file__).resolve().parents[1]
 
 CLONE_NEWNET = 0x40000000
@@ -176,12 +178,10 @@ def run_main(capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str,
 
     def run(main: Callable[[list[str]], None], *arguments: object, traceback: bool = False) -> tuple[int, str, str]:
         capfd.readouterr()
-        with pytest.raises(SystemExit) as end:
-            main([str(argument) for argument in arguments])
+        code = exit_code(main, *arguments)
         out, err = capfd.readouterr()
         assert traceback or "Traceback" not in err
-        code = end.value.code
-        return (code if isinstance(code, int) else 0), out, err
+        return code, out, err
 
     return run
 

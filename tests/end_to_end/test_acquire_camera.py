@@ -13,6 +13,7 @@ from processing.storage.captures.capture import Capture
 from processing.storage.products.images import StokesImage
 from simulators.camera.gige_camera import GigeCamera
 from simulators.rig.rig import SimulatedRig
+from tests.commands import exit_code
 
 Rig = Callable[..., Path]
 Acquire = Callable[..., tuple[int, str, str]]
@@ -23,9 +24,7 @@ THROUGH = ("--sample", "air", "--omega", 180)
 
 
 def run_process(*arguments: object) -> None:
-    with pytest.raises(SystemExit) as end:
-        process([str(argument) for argument in arguments])
-    assert not end.value.code
+    assert exit_code(process, *arguments) == 0
 
 
 def assert_horizontal(path: Path) -> None:

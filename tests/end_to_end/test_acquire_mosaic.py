@@ -18,6 +18,7 @@ from processing.commands.application import main as process
 from processing.storage.captures.capture import Capture
 from processing.storage.products.images import StokesImage
 from simulators.camera.node_map import node_map
+from tests.commands import exit_code
 
 Acquire = Callable[..., tuple[int, str, str]]
 Offset = tuple[int, int]
@@ -77,9 +78,7 @@ def stokes(
 def assert_light(path: Path) -> None:
     """Reduce a capture and compare what comes out with the light that went in."""
     out = path.with_suffix(".stokes.h5")
-    with pytest.raises(SystemExit) as end:
-        process(["reduce", str(path), "--out", str(out), "--no-figure"])
-    assert not end.value.code
+    assert exit_code(process, "reduce", path, "--out", out, "--no-figure") == 0
     s0, s1, s2 = StokesImage.load(out).values[:, 2:-2, 2:-2]
     aolp_deg = np.rad2deg(np.arctan2(s2, s1)) / 2
     # Noise of a pixel: 0.8 degrees, 0.02 in DoLP; a count of 8 bits is 2 % of the light.
@@ -142,9 +141,7 @@ def test_each_colour_reads_the_light_as_it_is_wherever_the_region_begins(stokes,
     with Capture(path) as capture:
         assert capture.header.mosaic == tuple(map(tuple, np.roll(SENSOR, (-y, -x), axis=(0, 1))))
         assert capture.header.colours == tuple(map(tuple, np.roll(COLOURS, (-y, -x), axis=(0, 1))))
-    with pytest.raises(SystemExit) as end:
-        process(["colours", str(path), "--out", str(out / "colours")])
-    assert not end.value.code
+    assert exit_code(process, "colours", path, "--out", out / "colours") == 0
     for part in ("red", "green_a", "green_b", "blue") if EVERY else ("red",):
         assert_light(out / "colours" / f"{path.stem}.{part}.h5")
 

@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from processing.commands.application import main as process
 from processing.storage.products.images import MuellerImage
+from tests.commands import exit_code
 
 PLAN = """
 kind: plan
@@ -67,9 +68,7 @@ def test_from_plan_to_product(name, acquire, small_rig, configs, tmp_path):
     code, _, err = acquire("--plan", plan, "--rig", rig, "--out", tmp_path / "out")
     assert code == 0, err
     (capture,) = (tmp_path / "out").glob("*.h5")
-    with pytest.raises(SystemExit) as end:
-        process(["reduce", str(capture), "--out", str(tmp_path / "m.h5"), "--no-figure"])
-    assert not end.value.code
+    assert exit_code(process, "reduce", capture, "--out", tmp_path / "m.h5", "--no-figure") == 0
     image = MuellerImage.load(tmp_path / "m.h5")
     assert image.facts["rank"] == rank
     is_determined = np.isfinite(image.values).any(axis=(2, 3)).reshape(16)

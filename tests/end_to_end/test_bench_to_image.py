@@ -15,6 +15,7 @@ from processing.storage.captures.capture import Capture
 from processing.storage.products.images import MuellerImage
 from processing.storage.products.product import Product, Step
 from simulators.bench.scene import Scene
+from tests.commands import exit_code
 
 
 def taken(out: str) -> Path:
@@ -24,9 +25,7 @@ def taken(out: str) -> Path:
 
 
 def process(*args: object) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main([str(a) for a in args])
-    assert not ended.value.code
+    assert exit_code(main, *args) == 0
 
 
 def scaled(image: np.ndarray, truth: np.ndarray) -> np.ndarray:

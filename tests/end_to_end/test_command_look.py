@@ -12,6 +12,7 @@ from processing.commands.command_line import application, run
 from processing.commands.diagnose import app as diagnose
 from processing.commands.program import main as umov
 from simulators.cli import app as simulate
+from tests.commands import exit_code
 from viewer.command import app as view
 
 COMMANDS = {
@@ -65,9 +66,7 @@ def test_every_command_has_short_help(name, command):
     ],
 )
 def test_a_wrong_option_is_told_as_every_mistake(name, words, message, capsys):
-    with pytest.raises(SystemExit) as end:
-        COMMANDS[name](words.split())
-    assert end.value.code == 2
+    assert exit_code(COMMANDS[name], *words.split()) == 2
     streams = capsys.readouterr()
     assert not streams.out
     assert streams.err.startswith("error: ")
@@ -95,25 +94,19 @@ def test_umov_has_every_command(name, capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["umov"])
     monkeypatch.setenv("UMOV_DOOR", "")
     for words, answer in (([name, "-h"], f"umov {name} [OPTIONS]"), ([name, "--version"], f"umov {version('umov')}")):
-        with pytest.raises(SystemExit) as end:
-            umov(words)
-        assert not end.value.code
+        assert exit_code(umov, *words) == 0
         assert answer in capsys.readouterr().out
 
 
 def test_umov_needs_no_process_before_a_command_of_it(capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["umov"])
     monkeypatch.setenv("UMOV_DOOR", "")
-    with pytest.raises(SystemExit) as end:
-        umov(["check", "-h"])
-    assert not end.value.code
+    assert exit_code(umov, "check", "-h") == 0
     assert "umov process check" in capsys.readouterr().out
 
 
 def test_umov_lists_its_commands(capsys):
     for words, code in (([], 2), (["-h"], 0), (["fly"], 2)):
-        with pytest.raises(SystemExit) as end:
-            umov(words)
-        assert end.value.code == code
+        assert exit_code(umov, *words) == code
         streams = capsys.readouterr()
         assert all(name in streams.out + streams.err for name in COMMANDS)

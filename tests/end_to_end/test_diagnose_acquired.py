@@ -8,6 +8,7 @@ import pytest
 
 from processing.commands import diagnose as cli
 from processing.instrument.model import InstrumentModel
+from tests.commands import exit_code
 
 
 @pytest.fixture
@@ -22,9 +23,7 @@ def diagnosed(acquire, small_rig, configs, tmp_path):
         (capture,) = Path(tmp_path).glob("*.h5")
         out, new = tmp_path / "said.json", tmp_path / "new.yaml"
         # Without --instrument it is the model in the capture.
-        with pytest.raises(SystemExit) as ended:
-            cli.main([str(capture), "--json", str(out), "--write", str(new)])
-        assert ended.value.code == 0
+        assert exit_code(cli.main, capture, "--json", out, "--write", new) == 0
         return json.loads(out.read_text())
 
     return run

@@ -18,15 +18,10 @@ from processing.storage.products.product import Product
 from simulators.bench.scene import Scene
 from simulators.blind import scene_faults
 from simulators.blind.sphere_suite import SphereFault, first_surface_of, take
+from tests.commands import exit_code
 
 NM, OMEGA_DEG = 662.0, 35.0
 FIRST_SURFACE = "kind: first_surface\nname: red print, first surface alone\nconstants:\n  662: {n: 1.30, k: 0.08}\n"
-
-
-def run(main, *arguments) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main([str(a) for a in arguments])
-    return stop.value.code or 0
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +71,7 @@ def test_first_surface_lacks_polarized_diffuse(name, configs, scene, tmp_path, c
         geometry,
     ]
     command += ["--write", new, "--json", tmp_path / "d.json", "--report", tmp_path / "d.html"]
-    assert run(diagnose, *command) == 0
+    assert exit_code(diagnose, *command) == 0
     text = capsys.readouterr().out
     assert "SIMULATED" in text
     assert "polarized_diffuse" in text
@@ -94,7 +89,7 @@ def test_first_surface_lacks_polarized_diffuse(name, configs, scene, tmp_path, c
     errors = []
     for material, out in ((plain, tmp_path / "before.h5"), (new, tmp_path / "after.h5")):
         options = ("--geometry", geometry, "--material", material, "--no-figure")
-        assert run(process, "xi0", stokes, *options, "--out", out) == 0
+        assert exit_code(process, "xi0", stokes, *options, "--out", out) == 0
         errors.append((*errors_of_m0(scene, material), error_of_xi0(scene, out)))
     (psi, size, xi0), (psi_after, size_after, xi0_after) = errors
     assert (psi, size) == pytest.approx((41, 28), abs=6)
@@ -102,7 +97,7 @@ def test_first_surface_lacks_polarized_diffuse(name, configs, scene, tmp_path, c
     assert size_after < 1.0
     assert xi0_after < 0.3 * xi0
 
-    assert run(diagnose, *command) == 2
+    assert exit_code(diagnose, *command) == 2
     assert "exists and is not replaced" in capsys.readouterr().err
 
 
@@ -115,14 +110,14 @@ def test_what_acquire_writes_in_stokes_mode_is_enough(acquire, small_rig, config
     plain.write_text(FIRST_SURFACE)
     options = ["--reflectance", plain, "--geometry", configs / "geometries/one_inch_sphere.yaml"]
     stokes, mueller = (configs / f"instruments/{name}.yaml" for name in ("linear_stokes", "rgb950"))
-    assert run(diagnose, path, "--instrument", stokes, *options, "--json", out) == 0
+    assert exit_code(diagnose, path, "--instrument", stokes, *options, "--json", out) == 0
     d = SurfaceDiagnosis.model_validate(json.loads(out.read_text()))
     assert (d.verdict, [e.kind for e in d.effects]) == ("explained", ["polarized_diffuse"])
     assert d.effects[0].parameters["a"].value == pytest.approx(0.17, abs=3.5 * d.effects[0].parameters["a"].stderr)
     # First surface alone does not know the normal; with what was found a sphere off its place would show.
     assert "registration[sphere]" not in d.unobservable
     capfd.readouterr()
-    assert run(diagnose, path, "--instrument", mueller, *options) == 2
+    assert exit_code(diagnose, path, "--instrument", mueller, *options) == 2
     assert "Use the instrument file that belongs to the capture" in capfd.readouterr().err
 
 
@@ -136,7 +131,7 @@ def test_geometry_and_instrument_that_were_found_end_the_error(configs, scene, t
     material = configs / "materials/red_print.yaml"
     geometry = configs / "geometries/one_inch_sphere.yaml"
     options = ["--instrument", configs / "instruments/rgb950.yaml", "--reflectance", material, "--geometry", geometry]
-    assert run(diagnose, path, *options, "--write", new) == 0
+    assert exit_code(diagnose, path, *options, "--write", new) == 0
     assert not new.exists()
     corrected = ViewingGeometry.load(tmp_path / "new.geometry.yaml")
     assert corrected.arm_zero_deg == pytest.approx(2.0, abs=0.4)
@@ -146,10 +141,10 @@ def test_geometry_and_instrument_that_were_found_end_the_error(configs, scene, t
         assert opened.header.omega_deg == OMEGA_DEG
     again = diagnose_object([path], instrument, load_reflectance(material), corrected)[0].diagnosis
     assert again.verdict == "consistent"
-    assert run(diagnose, path, *options, "--write", new) == 2
+    assert exit_code(diagnose, path, *options, "--write", new) == 2
 
 
 def test_both_files_are_needed(configs, tmp_path, capsys):
-    code = run(diagnose, tmp_path / "c.h5", "--instrument", "i.yaml", "--reflectance", "m.yaml")
+    code = exit_code(diagnose, tmp_path / "c.h5", "--instrument", "i.yaml", "--reflectance", "m.yaml")
     assert code == 2
     assert "needs both" in capsys.readouterr().err

@@ -45,6 +45,7 @@ from processing.commands.diagnose import main as diagnose
 from processing.geometry.viewing import ViewingGeometry
 from processing.storage.products.images import MuellerImage
 from simulators.cli import app as simulate_app
+from tests.commands import exit_code
 from viewer.command import app as view_app
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -163,11 +164,8 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def first_capture(checkout: Path) -> Path:
     """The capture of the tutorial's first command."""
-    with pytest.raises(SystemExit) as end:
-        acquire(
-            ["--omega", "35", "--rig", str(checkout / "configs/rigs/simulated.yaml"), "--out", str(checkout / "one")]
-        )
-    assert not end.value.code
+    rig = checkout / "configs/rigs/simulated.yaml"
+    assert exit_code(acquire, "--omega", 35, "--rig", rig, "--out", checkout / "one") == 0
     (capture,) = (checkout / "one").glob("*omega35.h5")
     return capture
 
@@ -187,9 +185,8 @@ def desk(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, defaul
 def run(words: list[str]) -> None:
     """Run a line of a shell block in this process, patterns of file names filled in as a shell does."""
     arguments = [name for word in words[2:] for name in (sorted(glob.glob(word)) if "*" in word else [word])]
-    with pytest.raises(SystemExit) as end:
-        RUNS[words[1]](arguments)
-    assert not end.value.code, f"{shlex.join(words)} ended with {end.value.code}"
+    code = exit_code(RUNS[words[1]], *arguments)
+    assert code == 0, f"{shlex.join(words)} ended with {code}"
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from acquisition.demo.truth import true_error
 from processing.commands import diagnose as diagnose_cli
 from processing.commands.application import main as process
 from simulators.bench.scene import Scene
+from tests.commands import exit_code
 
 SLOW = pytest.mark.skipif(not os.environ.get("UMOV_SLOW"), reason="half a minute each; UMOV_SLOW=1 runs them")
 
@@ -67,9 +68,7 @@ def busy(request):
 
 
 def run(main, *words) -> None:
-    with pytest.raises(SystemExit) as end:
-        main([str(word) for word in words])
-    assert not end.value.code, words
+    assert exit_code(main, *words) == 0, words
 
 
 def check(case: Case, acquire, rig, configs, folder, capfd) -> None:

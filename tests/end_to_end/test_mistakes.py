@@ -10,6 +10,7 @@ from acquisition.commands.application import main as acquire_main
 from processing.campaign.captures import find_captures
 from processing.commands.application import main as process
 from processing.commands.diagnose import main as diagnose
+from tests.commands import exit_code
 from tests.rig_files import change_yaml, write_rig
 
 
@@ -32,9 +33,7 @@ def run(capfd):
     """Runs `process`; returns exit code and standard error."""
 
     def done(*arguments):
-        with pytest.raises(SystemExit) as end:
-            process([str(argument) for argument in arguments])
-        return end.value.code or 0, capfd.readouterr().err
+        return exit_code(process, *arguments), capfd.readouterr().err
 
     return done
 
@@ -42,9 +41,8 @@ def run(capfd):
 @pytest.fixture(scope="module")
 def simulated_capture(tmp_path_factory, configs):
     folder = tmp_path_factory.mktemp("taken")
-    with pytest.raises(SystemExit) as end:
-        acquire_main(["--omega", "35", "--rig", str(write_rig(configs, folder / "rig.yaml")), "--out", str(folder)])
-    assert not end.value.code
+    rig = write_rig(configs, folder / "rig.yaml")
+    assert exit_code(acquire_main, "--omega", 35, "--rig", rig, "--out", folder) == 0
     (path,) = folder.glob("*omega35.h5")
     return path
 
@@ -72,17 +70,14 @@ def test_a_place_for_no_file_is_refused_before_the_work(acquire, small_rig, capt
     for command in (("snap", "--out", "no/frame.png"), ("init", "--out", "no/rig.yaml")):
         code, _, err = acquire(*command)
         assert (code, "there is no folder no. Make it" in err) == (2, True)
-    with pytest.raises(SystemExit) as end:
-        diagnose([str(capture), "--instrument", str(configs / "instruments/rgb950.yaml"), "--write", "no/where.yaml"])
-    assert end.value.code == 2
+    instrument = configs / "instruments/rgb950.yaml"
+    assert exit_code(diagnose, capture, "--instrument", instrument, "--write", "no/where.yaml") == 2
     message = "error: no/where.yaml: there is no folder no. Make it, or give another name.\n"
     assert capfd.readouterr() == ("", message)
     free = ("--free", "psa_retarder.retardance_deg", "--write", "no/where.yaml")
-    instrument = str(configs / "instruments/rgb950.yaml")
-    with pytest.raises(SystemExit) as end:
-        process(["calibrate", str(capture), "--instrument", instrument, *free])
+    assert exit_code(process, "calibrate", capture, "--instrument", instrument, *free) == 2
     # Not a word of the fit before.
-    assert (end.value.code, *capfd.readouterr()) == (2, "", message)
+    assert capfd.readouterr() == ("", message)
 
 
 def test_another_camera_s_instrument_file_and_a_place_for_no_figure_are_named(run, capture, configs, tmp_path, capfd):
@@ -104,9 +99,8 @@ def test_another_camera_s_instrument_file_and_a_place_for_no_figure_are_named(ru
         ):
             code, err = run(*command, "--instrument", files / file)
             assert (code, words in err, err.count("\n")) == (2, True, 1), err
-        with pytest.raises(SystemExit) as end:
-            diagnose([str(capture), "--instrument", str(files / file)])
-        assert (end.value.code, words in capfd.readouterr().err) == (2, True)
+        assert exit_code(diagnose, capture, "--instrument", files / file) == 2
+        assert words in capfd.readouterr().err
     # Neither is there a product where its figure could not be drawn.
     for figure in ("no/where.png", "figure.docx"):
         code, err = run("reduce", capture, "--out", tmp_path / "no.h5", "--figure", tmp_path / figure)

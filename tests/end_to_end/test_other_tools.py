@@ -23,6 +23,7 @@ from processing.storage.captures.schema import CaptureHeader
 from processing.storage.products.images import MuellerImage
 from processing.storage.products.product import Plane, Product
 from processing.storage.products.product_writer import ProductWriter
+from tests.commands import exit_code
 
 DOCS = Path(__file__).parents[2] / "docs"
 STATES, SHAPE = 24, (6, 8)
@@ -223,9 +224,8 @@ def exported(product, capture, tmp_path, capsys):
 
     def run(source: str, *options: str) -> list[Path]:
         capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            main(["export", str({"product": product, "capture": capture}[source]), "--out", f"{tmp_path}/e", *options])
-        assert end.value.code == 0, capsys.readouterr().err
+        file = {"product": product, "capture": capture}[source]
+        assert exit_code(main, "export", file, "--out", f"{tmp_path}/e", *options) == 0, capsys.readouterr().err
         return [Path(line) for line in capsys.readouterr().out.split()]
 
     return run
@@ -301,7 +301,7 @@ def test_noise_and_the_instruments_part_leave_with_their_names(capture, configs,
 
 def test_an_exported_scattering_table_reads_back_exactly(tmp_path, table, capsys):
     table = ScatteringTable.load(table)
-    assert _process("export", tmp_path / "table.h5", "--to", "csv") == 0
+    assert exit_code(main, "export", tmp_path / "table.h5", "--to", "csv") == 0
     path = tmp_path / "table.csv"
     assert capsys.readouterr().out.split() == [str(path)]
     assert "# simulated: True\n" in path.read_text()
@@ -319,16 +319,10 @@ def test_an_exported_scattering_table_reads_back_exactly(tmp_path, table, capsys
         np.testing.assert_array_equal(values[0, order], read[f"xi0_{name}"])
     np.testing.assert_array_equal(table.variance[:, order][0], read["xi0_sample_variance"])
 
-    assert _process("export", tmp_path / "table.h5", "--to", "csv", "--plane", "xi1", "--overwrite") == 2
+    assert exit_code(main, "export", tmp_path / "table.h5", "--to", "csv", "--plane", "xi1", "--overwrite") == 2
     assert "has no 'xi1'; it has: xi0" in capsys.readouterr().err
-    assert _process("export", tmp_path / "table.h5", "--to", "fits") == 2
+    assert exit_code(main, "export", tmp_path / "table.h5", "--to", "fits") == 2
     assert "is a scattering table: it goes into csv" in capsys.readouterr().err
-
-
-def _process(*words):
-    with pytest.raises(SystemExit) as end:
-        main([str(word) for word in words])
-    return end.value.code or 0
 
 
 def test_exported_maps_have_the_colours_of_the_reports(exported, monkeypatch):
@@ -375,7 +369,5 @@ def test_figures_are_written_and_nothing_is_replaced(exported, product, tmp_path
         (["--to", "nexus"], "is a NeXus file (HDF5) already"),
         (["--to", "csv", "--plane", "nothing"], "has no 'nothing'"),
     ):
-        with pytest.raises(SystemExit) as end:
-            main(["export", str(product), "--out", f"{tmp_path}/e", *options])
-        assert end.value.code == 2
+        assert exit_code(main, "export", product, "--out", f"{tmp_path}/e", *options) == 2
         assert message in capsys.readouterr().err

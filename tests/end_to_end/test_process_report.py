@@ -14,16 +14,16 @@ from processing.reduction.mueller import reduce_mueller
 from processing.reports.report import collect
 from processing.storage.captures.capture import Capture
 from processing.storage.products.product import Step
+from tests.commands import exit_code
 
 VISIBLE = "n => n.checkVisibility({contentVisibilityAuto: true})"
 
 
 def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str]:
-    with pytest.raises(SystemExit) as ended:
-        main([str(a) for a in args])
+    code = exit_code(main, *args)
     err = capsys.readouterr().err
     assert "Traceback" not in err
-    return int(ended.value.code or 0), err
+    return code, err
 
 
 @pytest.fixture

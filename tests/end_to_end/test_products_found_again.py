@@ -25,6 +25,7 @@ from processing.storage.products.provenance import content_of, file_identity, ma
 from simulators.bench.bench import SimulatedBench
 from simulators.bench.scene import Scene
 from simulators.bench.virtual_capture import write_virtual_capture
+from tests.commands import exit_code
 
 Run = Callable[..., str]
 
@@ -246,9 +247,7 @@ def test_a_table_is_not_replaced_and_counts_no_image_twice(capture, configs, pro
     count, content = ScatteringTable.load(out).count.sum(), out.read_bytes()
     assert [s.name for s in table_steps(out)] == ["table"]
     for options, message in (((), "exists"), (("--append",), "would count twice")):
-        with pytest.raises(SystemExit) as ended:
-            main([str(a) for a in (*table, *options)])
-        assert ended.value.code == 2
+        assert exit_code(main, *table, *options) == 2
         assert message in capfd.readouterr().err
         assert out.read_bytes() == content
     weighted = Reduction(capture, weighted=True).make(tmp_path / "w.h5")

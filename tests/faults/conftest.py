@@ -13,6 +13,8 @@ import h5py
 import numpy as np
 import pytest
 
+from tests.commands import exit_code
+
 #: What may differ between two runs of one plan: times, the camera's own count of its frames, and who took which state.
 TIMES = {"host_time_s", "camera_time_ns", "frame_id", "start_time", "closing/json"}
 #: How HDF5 keeps dimension scales: references, which differ from file to file.
@@ -192,9 +194,7 @@ def refused(tmp_path):
 
     def run(main, *arguments):
         start_s = time.process_time()
-        with pytest.raises(SystemExit) as end:
-            main([str(argument) for argument in arguments])
-        assert end.value.code == 2
+        assert exit_code(main, *arguments) == 2
         assert time.process_time() - start_s < 5
 
     return run

@@ -20,6 +20,7 @@ from processing.storage.formats.import_request import ImportRequest
 from processing.storage.formats.importing import import_capture
 from processing.storage.products.product import Plane, ProductError
 from processing.storage.products.product_writer import ProductWriter
+from tests.commands import exit_code
 
 TWICE = {
     "calibrate": (process, ["--instrument", "i.yaml", "--free", "x"]),
@@ -39,9 +40,7 @@ def test_a_file_given_twice_is_refused(name, configs, tmp_path, capfd, monkeypat
     monkeypatch.chdir(tmp_path)
     shutil.copy(configs / "geometries/one_inch_sphere.yaml", tmp_path / "g.yaml")
     link.symlink_to(file)
-    with pytest.raises(SystemExit) as end:
-        main([*([name] if main is process else []), str(file), str(link), *options])
-    assert end.value.code == 2
+    assert exit_code(main, *([name] if main is process else []), file, link, *options) == 2
     assert f"{link} is given twice, also as {file}" in capfd.readouterr().err
 
 

@@ -22,6 +22,7 @@ from processing.storage.captures.capture import Capture
 from processing.storage.integrity.checksums import state_crc32, summed_values
 from processing.storage.products.product import Product
 from simulators.clock import patient_clock
+from tests.commands import exit_code
 
 
 def test_lost_frames_are_taken_again_and_logged(run_with, intact):
@@ -282,9 +283,7 @@ def test_a_gain_that_changes_is_known_to_reduce_and_to_diagnose(run_with, tmp_pa
         ]
         assert text.partition("false frame: ")[2] in read_capture(capture, capture.instrument).evidence
     product = tmp_path / "product.h5"
-    with pytest.raises(SystemExit) as end:
-        main(["reduce", str(path), "--out", str(product), "--no-figure"])
-    assert end.value.code == 0
+    assert exit_code(main, "reduce", path, "--out", product, "--no-figure") == 0
     with Product(product) as reader:
         assert any("from state 20 on: the light is 1.1 times" in line for line in reader.facts["warnings"])
 

@@ -25,6 +25,7 @@ from simulators.blind.undeclared_captures import (
     state_angles,
     write_capture,
 )
+from tests.commands import exit_code
 
 STATES = 40
 
@@ -217,9 +218,7 @@ def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, c
     instrument, new = configs / "instruments/rgb950.yaml", tmp_path / "new.yaml"
     report, out = tmp_path / "report.html", tmp_path / "out.json"
     call = [str(path), "--instrument", str(instrument), "--write", str(new)]
-    with pytest.raises(SystemExit) as ended:
-        cli.main([*call, "--json", str(out), "--report", str(report), "--residuals", str(tmp_path / "r.npz")])
-    assert ended.value.code == 0
+    assert exit_code(cli.main, *call, "--json", out, "--report", report, "--residuals", tmp_path / "r.npz") == 0
     assert "psg_retardance" in capsys.readouterr().out
     keys = {"verdict", "error_before", "error_after", "noise_floor_percent", "effects", "unobservable"}
     document = json.loads(out.read_text())
@@ -240,15 +239,11 @@ def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, c
     # Found at 662 nm: it is not carried over to another wavelength.
     assert [len(model.at(nm).effects) for nm in (662, 451)] == [1, 0]
     assert diagnose_captures([path], model)[0].diagnosis.verdict == "consistent"
-    with pytest.raises(SystemExit) as ended:
-        cli.main(call)
-    assert ended.value.code == 2
+    assert exit_code(cli.main, *call) == 2
     assert "exists" in capsys.readouterr().err
     for name, target in (("--json", out), ("--report", report)):
         content = target.read_bytes()
-        with pytest.raises(SystemExit) as ended:
-            cli.main([*call[:3], name, str(target)])
-        assert ended.value.code == 2
+        assert exit_code(cli.main, *call[:3], name, target) == 2
         assert f"{target} exists and is not replaced" in capsys.readouterr().err
         assert target.read_bytes() == content
 

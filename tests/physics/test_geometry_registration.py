@@ -16,6 +16,7 @@ from processing.geometry.pose import refine_pose
 from processing.geometry.sphere import Sphere
 from processing.geometry.viewing import ViewingGeometry
 from simulators.bench.scene import Scene
+from tests.commands import exit_code
 
 CAMERA = PinholeCamera(rows=200, columns=220, pixel_mm=0.0353, focal_length_mm=60, distance_mm=262.7)
 
@@ -207,14 +208,10 @@ def test_camera_pose_command_writes_a_camera_file(tmp_path, capsys):
         cv2.imwrite(files[-1], image)
     board = ["--squares", "8x6", "--square-mm", "5", "--marker-mm", "3.6", "--pixel-mm", "0.01"]
     out = tmp_path / "camera.yaml"
-    with pytest.raises(SystemExit) as end:
-        main(["camera-pose", *files, *board, "--out", str(out)])
-    assert end.value.code == 0
+    assert exit_code(main, "camera-pose", *files, *board, "--out", out) == 0
     assert "reprojection error" in capsys.readouterr().out
     assert load_yaml(out, PinholeCamera).focal_length_mm == pytest.approx(20, rel=0.02)
-    with pytest.raises(SystemExit) as end:
-        main(["camera-pose", *files, "--squares", "eight", *board[2:], "--out", str(out)])
-    assert end.value.code == 2
+    assert exit_code(main, "camera-pose", *files, "--squares", "eight", *board[2:], "--out", out) == 2
     assert "8x6" in capsys.readouterr().err
 
 
