@@ -1,13 +1,26 @@
-"""Every effect of the folder: nothing at zero, units and bounds that make sense, a derivative that is one, a cause."""
+"""Every effect of the folders: what it does at zero, its derivative, and what makes a file an effect."""
+
+import ast
+import importlib
+import os
+import pkgutil
+import subprocess
+import sys
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from processing.effect import EffectError
+import processing
+from processing.diagnosis.search.candidate import pool
+from processing.effect import BASE, EffectError, load_effects
 from processing.instrument.applied_effects import apply_to, changes_at, changes_of, instrument_effects
-from processing.instrument.changes import Changes
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import InstrumentEffect
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
-from processing.reflectance.effects.base import reflectance_effects
+from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
 from simulators.conformance import EffectConformance, ReflectanceEffectConformance
 from simulators.conformance.effect import small_capture
 
@@ -71,3 +84,183 @@ def test_unknown_effects_are_refused(kind, element, configs):
     model, capture = small_capture(InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662))
     with pytest.raises(EffectError):
         apply_to(Changes(capture.conditions), model, AppliedEffect(kind=kind, element=element, parameters={}))
+
+
+ROOT = Path(processing.__file__).parent
+FOLDERS = ("processing.instrument.effects", "processing.reflectance.effects")
+FILES = [
+    (folder, info.name)
+    for folder in FOLDERS
+    for info in pkgutil.iter_modules(importlib.import_module(folder).__path__)
+    if info.name != BASE and not info.name.startswith("_")
+]
+
+#: A new effect of an instrument, whole.
+DIMMER = '''"""The source is dimmer. Cause: a filter. Mend: take it out."""
+from processing.effect import Parameter
+from processing.instrument.effects.base import OfOneCapture, SourceEffect
+
+class Dimmer(SourceEffect, OfOneCapture):
+    """Share of the light that is lost."""
+
+    def places(self, model, conditions):
+        return ("",)
+
+    def parameters(self, model, conditions, place):
+        return (Parameter("lost", "1", 0, 1, 0.1),)
+
+    def apply(self, changes, model, place, values):
+        changes.gain = changes.gain * (1 - values[0])
+'''
+#: A new effect of a reflectance, whole.
+SKEW = '''"""The arm is skew. Cause: a bent arm. Mend: straighten it."""
+from processing.effect import Parameter
+from processing.reflectance.effects.base import ReflectanceEffect
+
+class Skew(ReflectanceEffect):
+    """Degrees."""
+
+    def parameters(self, place):
+        return (Parameter("skew", "degree", -1, 1, 0.1),)
+
+    def bend(self, changes, place, values):
+        changes.arm_rad += values[0]
+'''
+#: What a user's commands do with the two folders.
+USE = """
+import numpy as np, sys
+import processing.commands.diagnose, processing.commands.loaded_late.diagnose_surface
+import processing.diagnosis.surface.write
+from processing.diagnosis.search.candidate import pool
+from processing.instrument.changes import Conditions
+from processing.instrument.model import InstrumentModel
+from processing.reflectance.effects.base import reflectance_effects
+model = InstrumentModel.load(sys.argv[1]).at(662)
+kinds = {c.kind for c in pool(model, [Conditions.of({"psg": np.arange(8.0) ** 2, "psa": np.arange(8.0) ** 2})])}
+print(processing.__path__[0])
+print(*sorted(kinds))
+print(*sorted(reflectance_effects()))
+"""
+
+
+@pytest.fixture
+def hidden(monkeypatch):
+    """Makes one module invisible to the search of the folders."""
+
+    def hide(folder: str, name: str) -> None:
+        iter_modules = pkgutil.iter_modules
+        path = importlib.import_module(folder).__path__
+
+        def without(where=None, prefix=""):
+            return (i for i in iter_modules(where, prefix) if not (i.name == name and list(where or ()) == list(path)))
+
+        monkeypatch.setattr(pkgutil, "iter_modules", without)
+        instrument_effects.cache_clear()
+        reflectance_effects.cache_clear()
+
+    yield hide
+    monkeypatch.undo()
+    instrument_effects.cache_clear()
+    reflectance_effects.cache_clear()
+
+
+def offered(configs: Path) -> set[str]:
+    """Kinds that `diagnose` offers for three instruments that have a place for every effect between them."""
+    kinds = set()
+    for file, nm in (("rgb950", 662), ("mosaic_polarimeter", 662), ("drr_imaging_630nm", 630)):
+        model = InstrumentModel.load(configs / f"instruments/{file}.yaml").at(nm)
+        model = model.model_copy(update={"calibrate": ()})
+        angles = np.random.default_rng(1).uniform(0, 360, 8)
+        conditions = Conditions.of(dict.fromkeys(model.axes, angles), tuple(c.name for c in model.channels))
+        # Two runs took the states.
+        kinds |= {c.kind for c in pool(model, [replace(conditions, run=np.arange(8) // 4)])}
+    return kinds | set(reflectance_effects())
+
+
+@cache
+def offered_by_all(configs: Path) -> set[str]:
+    return offered(configs)
+
+
+@pytest.mark.parametrize(("folder", "name"), FILES)
+def test_without_one_file_the_others_are_offered(folder, name, hidden, configs):
+    before = offered_by_all(configs)
+    effect = {**instrument_effects(), **reflectance_effects()}[name]
+    assert name in before or effect.from_file_only
+    hidden(folder, name)
+    # Two kinds are files of both folders.
+    twin = (FOLDERS[folder == FOLDERS[0]], name) in FILES and folder == FOLDERS[0]
+    assert offered(configs) == (before if twin else before - {name})
+
+
+def test_no_file_imports_an_effect():
+    effects = {f"{folder}.{name}" for folder, name in FILES}
+    for path in (p for top in ("processing", "simulators", "acquisition") for p in (ROOT.parent / top).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom):
+                names = {node.module, *(f"{node.module}.{a.name}" for a in node.names)}
+            elif isinstance(node, ast.Import):
+                names = {a.name for a in node.names}
+            else:
+                continue
+            assert not names & effects, f"{path} imports {names & effects}"
+
+
+def test_files_go_and_come_in_a_copy(tmp_path, configs):
+    # All but one of each folder are deleted, and one that is new comes.
+    for path in ROOT.rglob("*"):
+        folder = ".".join(("processing", *path.relative_to(ROOT).parent.parts))
+        is_hidden = (folder, path.stem) in FILES and path.stem not in ("psg_azimuth", "arm_zero")
+        target = tmp_path / "processing" / path.relative_to(ROOT)
+        if path.is_file() and not is_hidden and path.suffix != ".pyc":
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(path.read_bytes())
+    (tmp_path / "processing/instrument/effects/dimmer.py").write_text(DIMMER)
+    (tmp_path / "processing/reflectance/effects/skew.py").write_text(SKEW)
+    run = subprocess.run(
+        [sys.executable, "-c", USE, str(configs / "instruments/rgb950.yaml")],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )
+    assert run.stdout.splitlines() == [
+        str(tmp_path / "processing"),
+        "dimmer psg_azimuth",
+        "arm_zero skew",
+    ], run.stderr
+
+
+def test_a_plug_in_is_found_for_both_kinds(monkeypatch):
+    class EntryPoint:
+        name = "gremlin"
+
+        def __init__(self, family: type) -> None:
+            self.family = family
+
+        def load(self) -> type:
+            return self.family
+
+    class Gremlin(ReflectanceEffect):
+        def parameters(self, place):
+            return ()
+
+        def bend(self, changes, place, values):
+            pass
+
+    groups = []
+    monkeypatch.setattr("processing.effect.entry_points", lambda group: groups.append(group) or [EntryPoint(Gremlin)])
+    effects = load_effects(FOLDERS[1], ReflectanceEffect, "umov.reflectance_effects")
+    assert (effects["gremlin"].kind, groups) == ("gremlin", ["umov.reflectance_effects"])
+
+
+@pytest.mark.parametrize("text", ["", DIMMER + DIMMER.replace("Dimmer", "Second")])
+def test_a_file_without_just_one_effect_is_refused(text, tmp_path, monkeypatch):
+    name = f"folder_{len(text)}"
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "__init__.py").write_text("")
+    (tmp_path / name / "thing.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(EffectError, match="thing has to define one InstrumentEffect"):
+        load_effects(name, InstrumentEffect, "nothing")

@@ -1,4 +1,4 @@
-"""A region at an odd offset: the analyzers are where the capture says, not where the instrument file has them."""
+"""A region at an odd offset, and the border that campaigns leave out."""
 
 import re
 from pathlib import Path
@@ -7,9 +7,12 @@ import h5py
 import numpy as np
 import pytest
 
+from processing.campaign import run as campaign
 from processing.diagnosis.captures.read_capture import read_capture
 from processing.instrument.model import InstrumentModel
-from processing.reduction.stokes import reduce_stokes
+from processing.maps import material_fit as material_fit_images
+from processing.reduction.mosaic.demosaic import method_of
+from processing.reduction.stokes import DEFAULT_METHOD, reduce_stokes
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Detector
 from processing.storage.products.product import Step
@@ -63,3 +66,7 @@ def test_channels_may_have_any_names(synthetic_capture, configs: Path, tmp_path:
         with h5py.File(out) as h5:
             images.append(h5["entry/data/s1"][:])
     np.testing.assert_array_equal(*images)
+
+
+def test_campaigns_leave_out_what_demosaicing_mixes() -> None:
+    assert campaign.BORDER_PX == material_fit_images.BORDER_PX == method_of(DEFAULT_METHOD).reach

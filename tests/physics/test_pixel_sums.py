@@ -1,4 +1,6 @@
-"""Sums over pixels: strips and single precision say what all pixels at once say in double."""
+"""Sums over pixels, parts and states: each shortcut says what all of them at once say."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +10,8 @@ from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.instrument import pixel_sums
 from processing.diagnosis.instrument.features import FEATURES, derivatives_of_part
 from processing.diagnosis.instrument.moments import moments_of
-from processing.diagnosis.instrument.projection import add_block
+from processing.diagnosis.instrument.projection import Projected, add_block
+from processing.diagnosis.instrument.tiles import TileSlopes, add_tiles
 from processing.diagnosis.search.space import Sums
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
@@ -98,3 +101,91 @@ def test_squares_are_averaged_while_they_are_read(configs, tmp_path, monkeypatch
     assert np.argwhere(data.clipped).tolist() == [[8 // side, 11 // side]]
     assert np.flatnonzero(data.clipped_states).tolist() == [4]
     assert data.floor[0] * data.conditions.full_scale**2 * side**2 == pytest.approx((3.0 / 0.5) ** 2 + 1 / 12, rel=0.02)
+
+
+PART_FEATURES, PART_ROWS, PART_COLUMNS = 5, 7, 3
+
+
+@pytest.mark.parametrize("derivatives", [0, 2])
+def test_noise_reaches_the_residual_through_the_fitted_image_where_a_feature_is_a_derivative(derivatives):
+    random = np.random.default_rng(2)
+    around = np.arange(PART_FEATURES) >= PART_FEATURES - derivatives
+    root = random.normal(size=(PART_ROWS, PART_FEATURES, PART_FEATURES))
+    noise, a = root @ root.transpose(0, 2, 1), random.normal(size=(PART_ROWS, PART_COLUMNS))
+    z, c = random.normal(size=(PART_FEATURES, PART_ROWS, 4)), random.normal(size=(PART_FEATURES, PART_ROWS))
+    part = Projected(z[None], noise[None], a[None], c[None], around=around)
+
+    hat = a @ np.linalg.pinv(a)
+    outside = np.eye(PART_ROWS) - hat
+    # (rows of the counts, features, rows of the noise)
+    onto = np.stack([c[f][:, None] * (hat if around[f] else np.eye(PART_ROWS)) for f in range(PART_FEATURES)], axis=1)
+    onto_residual = np.einsum("ij,jfl->ifl", outside, onto)
+    mean = np.einsum("igl,lfg->ifl", onto_residual, noise)
+    assert part.expected[0] == pytest.approx(np.sum(onto_residual * mean))
+
+    da, dc = random.normal(size=(2, 1, PART_ROWS, PART_COLUMNS)), random.normal(size=(2, 1, PART_FEATURES, PART_ROWS))
+    moved = [
+        np.stack(
+            [dc[j, 0, f][:, None] * (hat if around[f] else np.eye(PART_ROWS)) for f in range(PART_FEATURES)], axis=1
+        )
+        - np.einsum("ij,jfl->ifl", da[j, 0] @ np.linalg.pinv(a), onto)
+        for j in range(2)
+    ]
+    _, pull, _ = part.slopes(da, dc)
+    assert pull == pytest.approx([np.sum(mean * each) for each in moved])
+
+
+CHANNELS, FREE_STATES, VALUES = 3, 6, 4
+
+
+@pytest.mark.parametrize("cut_off", [(), (7,), (3, 4, 5)])
+def test_states_apart_are_what_a_column_for_each_of_them_says(cut_off):
+    random = np.random.default_rng(5)
+    rows, sizes = CHANNELS * FREE_STATES, ("excess", "freedom", "square", "count", "gradient", "stretch", "curvature")
+    data = steady_capture(random.uniform(0.2, 0.8, (rows, 9, 9)), 1e-2)
+    moments = moments_of(data, 1)
+    block = replace(moments.blocks[0], rows=np.setdiff1d(np.arange(rows), cut_off))
+    a, da = random.normal(size=(rows, 1)), random.normal(size=(VALUES, rows, 1))
+    c, dc = np.zeros((len(FEATURES), rows)), np.zeros((VALUES, len(FEATURES), rows))
+    c[0], c[FEATURES.index("square")] = 1.0, random.normal(0, 0.02, rows)
+    c[FEATURES.index("dx")], dc[1, FEATURES.index("dy")] = random.normal(0, 0.1, rows), random.normal(size=rows)
+    dc[2, FEATURES.index("one")] = random.normal(size=rows)
+    dc[3, FEATURES.index("square")] = random.normal(size=rows)
+    of_state = np.arange(rows)[:, None] // CHANNELS == np.arange(FREE_STATES)
+    together, apart = Sums.empty(1, VALUES), Sums.empty(1, VALUES)
+    add_block(block, np.where(of_state, a, 0.0), c, np.where(of_state, da, 0.0), dc=dc, moments=moments, out=together)
+    add_block(block, a, c, da, dc=dc, moments=moments, out=apart, apart=CHANNELS)
+    for name in sizes:
+        expected = getattr(together, name)
+        assert getattr(apart, name) == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max()), name
+
+
+def test_states_apart_in_tiles_are_what_a_column_for_each_of_them_says():
+    random = np.random.default_rng(6)
+    rows, sizes = CHANNELS * FREE_STATES, ("excess", "freedom", "square", "count", "gradient", "stretch", "curvature")
+    data = steady_capture(random.uniform(0.2, 0.8, (rows, 32, 32)), 1e-2)
+    moments = moments_of(data, 2)
+    count = moments.tiles.x.size
+    a, at_nodes = random.normal(size=(count, rows, 1)), random.normal(size=(VALUES, 3, rows, 1))
+    c, dc = np.zeros((len(FEATURES), rows)), np.zeros((1, len(FEATURES), rows))
+    c[0], dc[0, FEATURES.index("square")] = 1.0, random.normal(size=rows)
+    of_state = np.arange(rows)[:, None] // CHANNELS == np.arange(FREE_STATES)
+    shares, sums = random.normal(size=(3, count)), []
+    for wide in (True, False):
+        presence = of_state if wide else np.ones((rows, 1))
+        slopes = TileSlopes(
+            at_nodes=at_nodes * presence,
+            shares=shares,
+            fields=np.array([1]),
+            da=(0.1 * np.ones((1, count, rows, 1))) * presence,
+            counted=np.array([2]),
+            dc=dc,
+        )
+        out = Sums.empty(2, VALUES)
+        add_tiles(
+            data, moments, moments.tiles, a * presence, c=c, slopes=slopes, out=out, apart=None if wide else CHANNELS
+        )
+        sums.append(out)
+    for name in sizes:
+        expected = getattr(sums[0], name)
+        assert getattr(sums[1], name) == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max()), name

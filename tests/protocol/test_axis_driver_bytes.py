@@ -5,11 +5,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.apt_frames import apt_framer
-from drivers.axes import apt, esp301, gcs2, gsc, lcc25, smc100, zaber
+from drivers.axes import apt, elliptec, esp301, gcs2, gsc, lcc25, smc100, zaber
 from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
 from drivers.serial_link import LONGEST_FRAME, line_framer
 from simulators.clock import FastClock, patient_clock
+from simulators.controllers import elliptec as elliptec_emulator
 from simulators.controllers import esp301 as esp301_emulator
+from simulators.controllers import zaber as zaber_emulator
+from simulators.serial.reply_faults import Fault
 from simulators.serial.serve_options import ServeOptions
 from tests.protocol.scripted import scripted, served
 
@@ -273,3 +276,156 @@ def test_errors_of_one_esp301_axis_are_kept_while_another_is_asked() -> None:
         with pytest.raises(CommandRejected, match="error 204: hardware limit"):
             second.check_fault()
         second.check_fault()
+
+
+def summed(body: str) -> bytes:
+    """Zaber text with its checksum: all characters and the checksum add up to zero modulo 256."""
+    check = next(value for value in range(256) if (sum(body.encode()) + value) % 256 == 0)
+    return f"{body}:{check:02X}".encode()
+
+
+def test_zaber_checksum_and_reply() -> None:
+    assert zaber.checksum("0 0 00") == "00"
+    assert zaber.checksum("1 1 07 move abs 10000") == "B9"
+    reply = zaber.parse_reply(b"@01 1 07 OK BUSY -- 0:E0")
+    assert reply == zaber.Reply(1, 1, 7, True, True, "--", "0")
+    for spoiled in (b"@01 1 07 OK IDLE -- 0:E0", b"@01 1 07 OK BUSY -- 0:", b"01 1 07 OK BUSY -- 0:E0", b"", b"\xff"):
+        assert zaber.parse_reply(spoiled) is None
+    assert zaber.parse_reply(b"@01 1 07 OK BUSY -- 0") == zaber.Reply(1, 1, 7, True, True, "--", "0", summed=False)
+
+
+def test_zaber_exchange_sorts_out_what_is_not_its_reply() -> None:
+    old, right = summed("02 1 99 OK IDLE -- 5"), summed("02 1 01 OK IDLE -- -77")
+    with scripted(
+        (b"/" + summed("2 1 01 get pos") + b"\n", b"!02 1 IDLE --\r\n#02 1 info\r\n@%b\r\n@%b\r\n" % (old, right)),
+        (b"/" + summed("2 1 02") + b"\n", b"@" + summed("02 1 02 OK BUSY WR 0") + b"\r\n"),
+        (b"/" + summed("2 1 03 fly") + b"\n", b"@" + summed("02 1 03 RJ IDLE -- BADCOMMAND") + b"\r\n"),
+    ) as (path, _):
+        line = zaber.ZaberLine(zaber.Config(port=path), patient_clock(), None)
+        assert line.ask(2, 1, "get pos", repeat=True).data == "-77"
+        assert line.ask(2, 1, "", repeat=True).busy
+        with pytest.raises(CommandRejected, match="BADCOMMAND"):
+            line.ask(2, 1, "fly", repeat=False)
+        line.close()
+
+
+@pytest.mark.parametrize("says", [b"OK IDLE -- 0", b"RJ IDLE -- BADCOMMAND"], ids=["none sent", "none known"])
+def test_zaber_replies_without_checksum_count_where_the_device_says_that_it_sends_none(says: bytes) -> None:
+    with scripted(
+        (b"/" + summed("0 0 01 get system.serial") + b"\n", b"@01 0 01 OK IDLE -- 4711\r\n"),
+        (b"/" + summed("1 0 02 get comm.checksum") + b"\n", b"@01 0 02 " + says + b"\r\n"),
+        (b"/" + summed("1 0 03 get comm.checksum") + b"\n", b"@01 0 03 " + says + b"\r\n"),
+        (b"/" + summed("1 1 04 get pos") + b"\n", b"@01 1 04 OK IDLE -- -77\r\n"),
+        # A checksum that is there must still be right.
+        (b"/" + summed("1 1 05 get pos") + b"\n", b"@01 1 05 OK IDLE -- -77:00\r\n"),
+    ) as (path, _):
+        line = zaber.ZaberLine(zaber.Config(port=path, reply_s=0.2), patient_clock(), None)
+        assert line.ask_all("get system.serial") == [(1, "4711")]
+        assert line.ask(1, 1, "get pos", repeat=False).data == "-77"
+        with pytest.raises(ReplyError):
+            line.ask(1, 1, "get pos", repeat=False)
+        line.close()
+
+
+def test_a_zaber_reply_that_lost_its_checksum_is_not_believed() -> None:
+    with scripted(
+        (b"/" + summed("0 0 01 get system.serial") + b"\n", b"@01 0 01 OK IDLE -- 47\r\n"),
+        (b"/" + summed("1 0 02 get comm.checksum") + b"\n", b"@" + summed("01 0 02 OK IDLE -- 1") + b"\r\n"),
+        (b"/" + summed("1 0 03 get comm.checksum") + b"\n", b"@" + summed("01 0 03 OK IDLE -- 1") + b"\r\n"),
+        (b"/" + summed("1 1 04 get pos") + b"\n", b"@01 1 04 OK IDLE -- 7\r\n"),
+    ) as (path, _):
+        line = zaber.ZaberLine(zaber.Config(port=path, reply_s=0.2), patient_clock(), None)
+        assert line.ask_all("get system.serial") == []
+        with pytest.raises(ReplyError):
+            line.ask(1, 1, "get pos", repeat=False)
+        line.close()
+
+
+def test_zaber_homes_at_the_lesser_of_two_speeds() -> None:
+    emulator = zaber_emulator.make(ServeOptions(homed=True, clock=FastClock(100.0, base=patient_clock())))
+    for device in emulator.devices:
+        device.approach_deg_s = 10 * device.axis.speed_deg_s
+    with served(emulator) as (path, lines):
+        axis = zaber.open("psg", zaber.Config(port=path, address=1), lines)
+        motion = axis.home()
+        assert motion.expected_s == pytest.approx(2 * 360.0 / axis.speed_deg_s, rel=1e-3)
+        motion.wait()
+
+
+def elliptec_after(*pairs: tuple[bytes, bytes]) -> list[tuple[bytes, bytes]]:
+    """The exchanges of opening a module, whose identification was recorded from a real mount, then these."""
+    opening = (b"0in", b"0IN0E1140050920201501016800023000\r\n"), (b"0gv", b"0GV64\r\n")
+    return [*[pair for pair in opening for _ in range(2)], *pairs]
+
+
+def test_elliptec_real_captures() -> None:
+    # The position, too, is a recording of a real mount.
+    position = (b"0gp", b"0POFFFFDA9C\r\n")
+    pairs = elliptec_after(position, position, (b"0gs", b"0GS09\r\n"), (b"0gs", b"0GS0D\r\n"))
+    with scripted(*pairs) as (path, lines):
+        axis = elliptec.open("psg", elliptec.Config(port=path, address="0", serial_number="11400509"), lines)
+        assert axis.counts_per_deg == pytest.approx(398.22, abs=0.01)
+        position = axis.read_position()
+        assert position.counts == -9572
+        assert position.deg == pytest.approx(-24.04, abs=0.01)
+        assert axis.is_moving()
+        assert not axis.is_moving()
+        with pytest.raises(CommandRejected, match="over-current"):
+            axis._do_check_fault()
+
+
+def test_a_module_that_answers_late_is_found_by_its_serial_number() -> None:
+    emulator = elliptec_emulator.make(ServeOptions(clock=FastClock(100.0, base=patient_clock())))
+    serial_number = elliptec_emulator.axis_configs(emulator, "none")[0].serial_number
+    # Of the two readings of its identity the first or the second.
+    for place in (1, 2):
+        with served(emulator) as (path, lines):
+            emulator.faults.add(Fault("late", from_command=place, commands=1, amount=0.13))
+            config = elliptec.Config(port=path, serial_number=serial_number, reply_s=0.1)
+            assert elliptec.open("psg", config, lines).describe().serial_number == serial_number
+
+
+def test_elliptec_end_message_just_before_the_status_still_proves_the_homing() -> None:
+    # The module's end of homing arrives between the question for its status and the answer to it.
+    pairs = elliptec_after(
+        (b"0gs", b"0GS00\r\n"),
+        (b"0ho0", b""),
+        (b"0gs", b"0PO00000000\r\n0GS00\r\n"),
+        (b"0gs", b"0GS00\r\n"),
+        *[(b"0gp", b"0PO00000000\r\n")] * 2,
+        (b"0gs", b"0GS00\r\n"),
+        *[(b"0gp", b"0PO00000000\r\n")] * 2,
+    )
+    with scripted(*pairs) as (path, lines):
+        config = elliptec.Config(port=path, address="0", pause_before_move_s=0.0)
+        axis = elliptec.open("psg", config, lines)
+        assert axis.home().wait().counts == 0
+
+
+def test_the_status_that_answers_a_stop_of_an_elliptec_is_no_answer_to_a_question() -> None:
+    pairs = elliptec_after(
+        # Busy: a module takes no stop on its way. The answer comes when the move is over and another question is asked.
+        (b"0st", b""),
+        (b"0gp", b"0GS09\r\n0PO00000000\r\n"),
+        (b"0gp", b"0PO00000000\r\n"),
+        # "Not supported", from a module that knows no stop, is no fault of its last move.
+        (b"0st", b"0GS03\r\n"),
+        (b"0gs", b"0GS00\r\n"),
+        (b"0st", b""),
+        (b"0gs", b"0GS00\r\n0GS09\r\n"),
+        # It may never come.
+        (b"0st", b""),
+        (b"0gs", b"0GS09\r\n"),
+        (b"0gs", b"0GS09\r\n"),
+    )
+    with scripted(*pairs) as (path, lines):
+        axis = elliptec.open("psg", elliptec.Config(port=path, address="0", reply_s=0.2), lines)
+        axis.stop()
+        assert axis.read_position().counts == 0
+        axis.stop()
+        assert not axis.is_moving()
+        axis.check_fault()
+        axis.stop()
+        assert axis.is_moving()
+        axis.stop()
+        assert axis.is_moving()
