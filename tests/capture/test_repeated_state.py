@@ -8,10 +8,10 @@ from acquisition.capture.repeated_state import RepeatedState
 BLACK = 64.0
 
 
-def seen(first: np.ndarray, again: np.ndarray) -> str | None:
+def seen(first: np.ndarray, second: np.ndarray) -> str | None:
     look = RepeatedState(BLACK)
     assert look.look(0, 0.01, (0.0,), first) is None
-    return look.look(1, 0.01, (0.0,), again)
+    return look.look(1, 0.01, (0.0,), second)
 
 
 def frame(shape: tuple[int, int], seed: int, slope: float = 0.0) -> np.ndarray:

@@ -95,17 +95,17 @@ def test_an_axis_within_its_tolerance_is_on_its_target(rig, runner_of, off_deg):
 
 
 def test_a_lost_frame_is_taken_again_next_and_counted(rig, runner_of):
-    heard = Heard()
+    observer = Heard()
     rig.lost = {2, 4}
-    runner = runner_of(observers=(heard,))
+    runner = runner_of(observers=(observer,))
     assert runner.run(range(3))
     # State 2 was under way when the loss of state 1 was known; the second loss costs one more round.
-    assert heard.exposed == [(0, 0), (1, 0), (2, 0), (1, 1), (1, 2)]
+    assert observer.exposed == [(0, 0), (1, 0), (2, 0), (1, 1), (1, 2)]
     assert runner.writer.states() == [0, 2, 1]
     assert [record.columns["retakes"] for record in runner.writer.records] == [0, 0, 2]
-    assert "state 1: frame lost (no frame within 1 s), taken again, try 1 of 2" in heard.warnings[0]
-    assert "try 2 of 2" in heard.warnings[1]
-    assert all(any(warning in text for text in runner.messages.texts) for warning in heard.warnings)
+    assert "state 1: frame lost (no frame within 1 s), taken again, try 1 of 2" in observer.warnings[0]
+    assert "try 2 of 2" in observer.warnings[1]
+    assert all(any(warning in text for text in runner.messages.texts) for warning in observer.warnings)
 
 
 def test_a_state_that_is_lost_in_every_try_ends_the_run(rig, runner_of):
@@ -119,13 +119,13 @@ def test_a_state_that_is_lost_in_every_try_ends_the_run(rig, runner_of):
 
 
 def test_an_exposure_that_does_not_end_is_taken_again(rig, runner_of):
-    heard = Heard()
+    observer = Heard()
     rig.never_exposed = {2}
-    runner = runner_of(observers=(heard,))
+    runner = runner_of(observers=(observer,))
     assert runner.run(range(3))
-    assert heard.exposed == [(0, 0), (1, 0), (1, 1), (2, 0)]
+    assert observer.exposed == [(0, 0), (1, 0), (1, 1), (2, 0)]
     assert runner.writer.states() == [0, 1, 2]
-    assert "state 1: frame lost (it still exposes), taken again" in heard.warnings[0]
+    assert "state 1: frame lost (it still exposes), taken again" in observer.warnings[0]
 
 
 def test_tries_are_counted_anew_in_the_next_run(rig, runner_of):
@@ -141,10 +141,10 @@ def test_what_is_noted_of_a_state(rig, runner_of):
     pixels[0, :2] = 4095
     pixels[1, 0] = 139
     rig.picture = lambda number: pixels
-    heard = Heard()
-    runner = runner_of(psg=(3.0,), observers=(heard,))
+    observer = Heard()
+    runner = runner_of(psg=(3.0,), observers=(observer,))
     runner.run([0])
-    (record,), (report,) = runner.writer.records, heard.reports
+    (record,), (report,) = runner.writer.records, observer.reports
     # Near black: below 1 % of the range above the black level, which is 139.95 here.
     monitor = (pixels.mean() - 100.0) / EXPOSURE_S
     assert record.columns == {
@@ -253,15 +253,15 @@ def test_the_long_exposures_of_a_bracket_may_saturate(rig, runner_of):
 
 
 def test_a_darker_start_forgets_the_states_and_shortens_every_exposure(rig, runner_of):
-    heard = Heard()
-    runner = runner_of(exposure_s=(0.5, 0.5, 0.123456), observers=(heard,))
+    observer = Heard()
+    runner = runner_of(exposure_s=(0.5, 0.5, 0.123456), observers=(observer,))
     runner.run(range(3))
     runner.start_darker("state 1 is saturated")
     assert runner.writer.asked["forget"] == 1
     assert runner.ledger.states == 0
     assert runner.writer.exposures == [[0.3, 0.3, 0.0741]]
     assert runner.table.exposure_s.tolist() == [0.3, 0.3, 0.0741]
-    assert heard.warnings == ["state 1 is saturated; beginning again at 0.6 of the exposure"]
+    assert observer.warnings == ["state 1 is saturated; beginning again at 0.6 of the exposure"]
     # The exposure itself stands in the states; nobody has to be warned of it.
     assert len(runner.messages.texts) == 1
 
@@ -323,9 +323,9 @@ def test_a_stop_that_fails_as_well_is_told_with_the_first_error(rig, runner_of):
 
 
 def test_observers_hear_what_the_rig_does(rig, runner_of):
-    heard = Heard()
-    runner_of(observers=(heard,)).tell("moving")
-    assert heard.activities == ["moving"]
+    observer = Heard()
+    runner_of(observers=(observer,)).tell("moving")
+    assert observer.activities == ["moving"]
 
 
 def test_the_oldest_messages_are_kept_and_the_others_counted():
@@ -340,9 +340,9 @@ def test_the_oldest_messages_are_kept_and_the_others_counted():
 
 @pytest.mark.parametrize(("light", "times"), [(0, 1), (40, 0)])
 def test_a_capture_without_light_says_so_once(rig, runner_of, light, times):
-    heard = Heard()
+    observer = Heard()
     rig.picture = lambda number: np.full((4, 5), 100 + (light if number > 2 else 0), np.uint16)
     psg = (0.0, 10.0, *(9.0 * k for k in range(12)))
-    assert runner_of(psg=psg, role=("dark", "dark") + ("sample",) * 12, observers=(heard,)).run(range(14))
-    warnings = [text for text in heard.warnings if "no brighter than the dark ones: is the source on" in text]
+    assert runner_of(psg=psg, role=("dark", "dark") + ("sample",) * 12, observers=(observer,)).run(range(14))
+    warnings = [text for text in observer.warnings if "no brighter than the dark ones: is the source on" in text]
     assert len(warnings) == times

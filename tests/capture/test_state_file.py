@@ -206,24 +206,24 @@ def test_every_reader_is_shown_texts_of_their_own_length(path, file):
 
 @pytest.mark.parametrize("records", [("short", "much longer than that"), ("much longer than that", "short")])
 def test_a_text_that_is_cut_off_anywhere_reads_as_before_or_as_it_is_now(path, file, monkeypatch, records):
-    before, now = ({"end_time": text} for text in records)
-    file.write_closing(before)
-    file.add_segment_record(before)
+    old, new = ({"end_time": text} for text in records)
+    file.write_closing(old)
+    file.add_segment_record(old)
     sync, closings = file.sync, []
 
     def look():
         copy = Path(shutil.copy(path, path.with_name("copy.h5")))
         with Capture(copy) as reader:
-            assert reader.closing in (before, now)
-            assert file.segment_records() in ([before], [before, now])
+            assert reader.closing in (old, new)
+            assert file.segment_records() in ([old], [old, new])
             closings.append(reader.closing)
 
     monkeypatch.setattr(file, "sync", lambda: (sync(), look()))
-    file.write_closing(now)
-    file.add_segment_record(now)
+    file.write_closing(new)
+    file.add_segment_record(new)
     # Two steps each: the length of a text, and what stands in it.
     assert len(closings) == 4
-    assert closings[-1] == now
+    assert closings[-1] == new
 
 
 def test_padded_texts_of_an_older_file_are_gone_on_with(path, file, raw):

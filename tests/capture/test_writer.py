@@ -145,11 +145,11 @@ def test_going_on_with_a_partial_file_fills_what_is_missing(create, tmp_path):
     writer.put(record(0))
     path = writer.seal("failed", {}, keep_partial=True)
     assert seal_whole(path) is None
-    again = CaptureWriter(path)
+    second = CaptureWriter(path)
     for state in (1, 2):
-        again.put(record(state))
-    again.settle()
-    again.abandon()
+        second.put(record(state))
+    second.settle()
+    second.abandon()
     assert seal_whole(path) == tmp_path / "c.h5"
     with Capture(tmp_path / "c.h5") as capture:
         assert capture.status == "complete"
@@ -227,16 +227,16 @@ def test_the_blocks_are_taken_before_the_first_state(create):
 
 def test_an_error_of_the_disc_is_told_at_once_and_by_the_next_call(create, monkeypatch):
     errors: list[AcquisitionError] = []
-    heard = threading.Event()
+    failure = threading.Event()
 
     def fail(*_: object) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr(StateFile, "write_state", fail)
     writer = create()
-    writer.on_failure = lambda error: (errors.append(error), heard.set())
+    writer.on_failure = lambda error: (errors.append(error), failure.set())
     writer.put(record(0))
-    heard.wait()
+    failure.wait()
     assert "could not be written ([Errno 5] Input/output error)" in str(errors[0])
     for call in (lambda: writer.put(record(1)), writer.settle, lambda: writer.seal("complete", {})):
         with pytest.raises(AcquisitionError, match=r"Input/output error\). States done before it are intact"):
@@ -320,22 +320,22 @@ def test_a_disc_that_takes_nothing_is_given_up_after_a_while_and_the_next_state_
 
 def test_a_disc_that_blocks_while_nobody_hands_over_a_state_is_told_of(create, monkeypatch):
     errors: list[AcquisitionError] = []
-    heard, going_on = threading.Event(), multiprocessing.Event()
+    failure, going_on = threading.Event(), multiprocessing.Event()
     write = StateFile.write_state
     monkeypatch.setattr(StateFile, "write_state", lambda *arguments: (going_on.wait(), write(*arguments)))
     writer = create(clock=Passing())
-    writer.on_failure = lambda error: (errors.append(error), heard.set())
+    writer.on_failure = lambda error: (errors.append(error), failure.set())
     writer.put(record(0))
-    assert heard.wait(60)
+    assert failure.wait(60)
     assert f"the disc has not taken a state for {DEAD_S:g} s" in str(errors[0])
     going_on.set()
 
 
 def test_a_long_time_without_a_state_is_no_failure_of_the_disc(create):
-    heard, clock = threading.Event(), ManualClock()
+    failure, clock = threading.Event(), ManualClock()
     clock.sleep_s(10 * DEAD_S)
-    create(clock=clock).on_failure = lambda _: heard.set()
-    assert not heard.wait(3 * LOOK_S)
+    create(clock=clock).on_failure = lambda _: failure.set()
+    assert not failure.wait(3 * LOOK_S)
 
 
 def test_relative_names_are_of_the_folder_that_the_program_is_in_now(tmp_path, monkeypatch):

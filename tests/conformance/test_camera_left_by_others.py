@@ -33,22 +33,22 @@ class Left(DescribedCamera):
 
 
 @pytest.fixture
-def used(tmp_path: Path) -> Iterator[Left]:
+def bench_camera(tmp_path: Path) -> Iterator[Left]:
     with ExitStack() as stack:
         yield Left(tmp_path, stack)
 
 
 @pytest.mark.parametrize("access", ["RW", "RO"])
-def test_the_bench_rests_until_a_delayed_exposure_has_ended(used: Left, access: str) -> None:
+def test_the_bench_rests_until_a_delayed_exposure_has_ended(bench_camera: Left, access: str) -> None:
     old = "<Min>16</Min><Max>1000</Max></Float>"
-    assert old in used.text
-    used.text = used.text.replace(old, "<Min>16</Min><Max>1000000</Max></Float>")
-    where, named = used.text.split('<FloatReg Name="TriggerDelayReg">')
-    used.text = where + '<FloatReg Name="TriggerDelayReg">' + named.replace("RW", access, 1)
-    simulated = used.play()
+    assert old in bench_camera.text
+    bench_camera.text = bench_camera.text.replace(old, "<Min>16</Min><Max>1000000</Max></Float>")
+    where, named = bench_camera.text.split('<FloatReg Name="TriggerDelayReg">')
+    bench_camera.text = where + '<FloatReg Name="TriggerDelayReg">' + named.replace("RW", access, 1)
+    simulated = bench_camera.play()
     with simulated._nodes.assuming("TriggerSelector", "FrameStart"):
         simulated.leave("TriggerDelay", 150_000.0)
-    camera = used.open()
+    camera = bench_camera.open()
     if access == "RO":
         with pytest.raises(SettingRefused, match="TriggerDelay is 150000"):
             camera.configure(LIGHT)
@@ -61,10 +61,12 @@ def test_the_bench_rests_until_a_delayed_exposure_has_ended(used: Left, access: 
     assert float(camera.node_map()["TriggerDelay"]) == 16.0
 
 
-def test_a_delay_that_is_wanted_is_waited_for(used: Left) -> None:
-    used.text = used.text.replace("<Min>16</Min><Max>1000</Max></Float>", "<Min>16</Min><Max>1000000</Max></Float>")
-    simulated = used.play()
-    camera = used.open(features={"TriggerSelector": "FrameStart", "TriggerDelay": 150_000})
+def test_a_delay_that_is_wanted_is_waited_for(bench_camera: Left) -> None:
+    bench_camera.text = bench_camera.text.replace(
+        "<Min>16</Min><Max>1000</Max></Float>", "<Min>16</Min><Max>1000000</Max></Float>"
+    )
+    simulated = bench_camera.play()
+    camera = bench_camera.open(features={"TriggerSelector": "FrameStart", "TriggerDelay": 150_000})
     camera.configure(LIGHT)
     exposure = camera.trigger()
     exposure.wait_exposed()
@@ -83,96 +85,98 @@ def test_a_delay_that_is_wanted_is_waited_for(used: Left) -> None:
     ],
 )
 def test_a_mode_that_spoils_frames_is_off_or_the_capture_is_refused(
-    used: Left, name: str, entries: tuple[str, ...]
+    bench_camera: Left, name: str, entries: tuple[str, ...]
 ) -> None:
-    used.choice(name, *entries)
-    used.play(**{name: entries[0]})
-    camera = used.open()
+    bench_camera.choice(name, *entries)
+    bench_camera.play(**{name: entries[0]})
+    camera = bench_camera.open()
     camera.configure(LIGHT)
     for frame in camera.capture(3):
         np.testing.assert_array_equal(frame.pixels, SEEN)
-    assert {info.exposure_s for info in used.infos} == {5e-3}
+    assert {info.exposure_s for info in bench_camera.infos} == {5e-3}
     assert camera.node_map()[name] == "Off"
 
 
 @pytest.mark.parametrize("name", ["BalanceWhiteAuto", "TestPattern", "SequencerMode"])
-def test_one_that_cannot_be_set_is_named(used: Left, name: str) -> None:
-    used.choice(name, "Other", "Off", access="RO")
-    used.play(**{name: "Other"})
+def test_one_that_cannot_be_set_is_named(bench_camera: Left, name: str) -> None:
+    bench_camera.choice(name, "Other", "Off", access="RO")
+    bench_camera.play(**{name: "Other"})
     with pytest.raises(SettingRefused, match=f"{name} is Other and could not be set to Off"):
-        used.open().configure(LIGHT)
+        bench_camera.open().configure(LIGHT)
 
 
-def test_a_binning_by_words_is_undone(used: Left) -> None:
+def test_a_binning_by_words_is_undone(bench_camera: Left) -> None:
     for axis in ("Horizontal", "Vertical"):
-        used.text = used.text.replace(f'Name="Binning{axis}"', f'Name="Other{axis}"')
-        used.text = used.text.replace(f"<pFeature>Binning{axis}</pFeature>", "")
-        used.choice(f"Binning{axis}", "X1", "X2", "X4")
-    used.play(BinningVertical="X4")
-    camera = used.open()
+        bench_camera.text = bench_camera.text.replace(f'Name="Binning{axis}"', f'Name="Other{axis}"')
+        bench_camera.text = bench_camera.text.replace(f"<pFeature>Binning{axis}</pFeature>", "")
+        bench_camera.choice(f"Binning{axis}", "X1", "X2", "X4")
+    bench_camera.play(BinningVertical="X4")
+    camera = bench_camera.open()
     assert camera.configure(LIGHT).binning == 1
     assert camera.node_map()["BinningVertical"] == "X1"
 
 
-def test_a_digital_shift_is_undone(used: Left) -> None:
-    used.add("DigitalShift", '<Integer Name="DigitalShift">VALUE<Min>0</Min><Max>4</Max></Integer>')
-    used.play(DigitalShift=2)
-    camera = used.open()
+def test_a_digital_shift_is_undone(bench_camera: Left) -> None:
+    bench_camera.add("DigitalShift", '<Integer Name="DigitalShift">VALUE<Min>0</Min><Max>4</Max></Integer>')
+    bench_camera.play(DigitalShift=2)
+    camera = bench_camera.open()
     camera.configure(LIGHT)
     np.testing.assert_array_equal(camera.capture()[0].pixels, SEEN)
 
 
 @pytest.mark.parametrize(("unit", "rig_unit"), [("x", None), ("", "factor"), ("dB", None), ("", "dB")])
-def test_six_decibels_are_six_decibels_in_any_unit(used: Left, unit: str, rig_unit: str | None) -> None:
+def test_six_decibels_are_six_decibels_in_any_unit(bench_camera: Left, unit: str, rig_unit: str | None) -> None:
     low, high = ("0", "24") if "dB" in (unit, rig_unit) else ("1", "16")
     new = f"<Min>{low}</Min><Max>{high}</Max>" + (f"<Unit>{unit}</Unit>" if unit else "")
-    used.text = used.text.replace("<Min>0</Min><Max>24</Max><Unit>dB</Unit>", new)
-    simulated = used.play()
-    back = used.open(gain_unit=rig_unit).configure(LIGHT.model_copy(update={"gain_db": 6.0}))
+    bench_camera.text = bench_camera.text.replace("<Min>0</Min><Max>24</Max><Unit>dB</Unit>", new)
+    simulated = bench_camera.play()
+    back = bench_camera.open(gain_unit=rig_unit).configure(LIGHT.model_copy(update={"gain_db": 6.0}))
     assert back.gain_db == pytest.approx(6.0, abs=1e-3)
     assert simulated._nodes.value("Gain") == pytest.approx(6.0 if "dB" in (unit, rig_unit) else 1.9953, abs=1e-3)
 
 
-def test_a_gain_without_a_unit_is_refused(used: Left) -> None:
-    used.text = used.text.replace("<Unit>dB</Unit>", "")
-    used.play()
+def test_a_gain_without_a_unit_is_refused(bench_camera: Left) -> None:
+    bench_camera.text = bench_camera.text.replace("<Unit>dB</Unit>", "")
+    bench_camera.play()
     with pytest.raises(SettingRefused, match="gain_unit: factor"):
-        used.open().configure(LIGHT.model_copy(update={"gain_db": 6.0}))
+        bench_camera.open().configure(LIGHT.model_copy(update={"gain_db": 6.0}))
 
 
-def test_the_frame_rate_is_lowered_for_an_exposure_that_it_limits(used: Left) -> None:
+def test_the_frame_rate_is_lowered_for_an_exposure_that_it_limits(bench_camera: Left) -> None:
     # Lucid: 44.6 ms by default, 199.8 ms at 5 frames a second.
-    used.flag("AcquisitionFrameRateEnable")
-    used.add(
+    bench_camera.flag("AcquisitionFrameRateEnable")
+    bench_camera.add(
         "AcquisitionFrameRate",
         '<Float Name="AcquisitionFrameRate">VALUE<Min>0.5</Min><Max>22</Max><Unit>Hz</Unit></Float>',
         kind="FloatReg",
         length=8,
     )
-    used.text = used.text.replace(
+    bench_camera.text = bench_camera.text.replace(
         "<pMax>ExposureMost</pMax><Unit>us</Unit></Float>",
         '<pMax>ExposureByRate</pMax><Unit>us</Unit></Float><SwissKnife Name="ExposureByRate"><pVariable Name="ON">'
         'AcquisitionFrameRateEnableAt</pVariable><pVariable Name="RATE">AcquisitionFrameRateAt</pVariable>'
         "<Formula>(ON=1)?(1000000/RATE-200):44600</Formula></SwissKnife>",
     )
-    used.play(AcquisitionFrameRate=22.0)
-    camera = used.open()
+    bench_camera.play(AcquisitionFrameRate=22.0)
+    camera = bench_camera.open()
     assert camera.configure(LIGHT).exposure_s == 5e-3
     # In the midst of a capture, as a bracket does.
     for exposure_s in (0.2, 0.01, 0.25):
         back = camera.configure(LIGHT.model_copy(update={"exposure_s": exposure_s}))
         assert back.exposure_s == pytest.approx(exposure_s, rel=1e-3)
         camera.capture()
-        assert used.infos[-1].exposure_s == pytest.approx(exposure_s, rel=1e-3)
+        assert bench_camera.infos[-1].exposure_s == pytest.approx(exposure_s, rel=1e-3)
     with pytest.raises(SettingRefused, match="its limits are"):
         camera.configure(LIGHT.model_copy(update={"exposure_s": 3.0}))
 
 
 @pytest.mark.parametrize("choosable", [True, False])
-def test_the_converter_has_the_bits_of_the_format_or_counts_end_where_it_ends(used: Left, choosable: bool) -> None:
-    used.choice("AdcBitDepth", "Bit8", "Bit10", "Bit12", access="RW" if choosable else "RO")
-    used.play(AdcBitDepth="Bit10")
-    camera = used.open()
+def test_the_converter_has_the_bits_of_the_format_or_counts_end_where_it_ends(
+    bench_camera: Left, choosable: bool
+) -> None:
+    bench_camera.choice("AdcBitDepth", "Bit8", "Bit10", "Bit12", access="RW" if choosable else "RO")
+    bench_camera.play(AdcBitDepth="Bit10")
+    camera = bench_camera.open()
     camera.configure(LIGHT)
     (frame,) = camera.capture()
     assert (camera.top_of_counts.step, camera.full_scale) == ((1, 4095) if choosable else (4, 4092))
@@ -180,12 +184,12 @@ def test_the_converter_has_the_bits_of_the_format_or_counts_end_where_it_ends(us
 
 
 @pytest.mark.parametrize("loads", ["UserSetLoad", "UserSetSave"])
-def test_a_feature_of_unknown_meaning_is_at_its_default_or_named(used: Left, loads: str) -> None:
-    used.choice("UserSetSelector", "Default", "UserSet1")
-    used.add(loads, f'<Command Name="{loads}">VALUE<CommandValue>1</CommandValue></Command>')
-    used.choice("ShotMixing", "Plain", "Mixed")
-    used.play(ShotMixing="Mixed", UserSetSelector="UserSet1")
-    camera = used.open()
+def test_a_feature_of_unknown_meaning_is_at_its_default_or_named(bench_camera: Left, loads: str) -> None:
+    bench_camera.choice("UserSetSelector", "Default", "UserSet1")
+    bench_camera.add(loads, f'<Command Name="{loads}">VALUE<CommandValue>1</CommandValue></Command>')
+    bench_camera.choice("ShotMixing", "Plain", "Mixed")
+    bench_camera.play(ShotMixing="Mixed", UserSetSelector="UserSet1")
+    camera = bench_camera.open()
     camera.configure(LIGHT)
     if loads == "UserSetLoad":
         assert (camera.node_map()["ShotMixing"], camera.warnings()) == ("Plain", [])
@@ -195,13 +199,13 @@ def test_a_feature_of_unknown_meaning_is_at_its_default_or_named(used: Left, loa
         assert "ShotMixing" in text
 
 
-def test_a_load_that_changes_nothing_is_seen(used: Left) -> None:
-    used.choice("UserSetSelector", "Default")
-    used.add("UserSetLoad", '<Command Name="UserSetLoad">VALUE<CommandValue>1</CommandValue></Command>')
-    used.choice("ShotMixing", "Plain", "Mixed")
-    simulated = used.play(ShotMixing="Mixed")
+def test_a_load_that_changes_nothing_is_seen(bench_camera: Left) -> None:
+    bench_camera.choice("UserSetSelector", "Default")
+    bench_camera.add("UserSetLoad", '<Command Name="UserSetLoad">VALUE<CommandValue>1</CommandValue></Command>')
+    bench_camera.choice("ShotMixing", "Plain", "Mixed")
+    simulated = bench_camera.play(ShotMixing="Mixed")
     simulated._features.heard = lambda *_: []  # type: ignore[method-assign]
-    camera = used.open()
+    camera = bench_camera.open()
     camera.configure(LIGHT)
     (text,) = camera.warnings()
     assert "changed nothing" in text
@@ -215,9 +219,9 @@ def test_a_load_that_changes_nothing_is_seen(used: Left) -> None:
         ("FrameStart", "LineStart", "its TriggerSelector offers only AcquisitionStart, LineStart"),
     ],
 )
-def test_a_camera_that_no_trigger_makes_expose_is_named_so(used: Left, old: str, new: str, reason: str) -> None:
-    used.text = used.text.replace(old, new)
-    used.play()
+def test_a_camera_that_no_trigger_makes_expose_is_named_so(bench_camera: Left, old: str, new: str, reason: str) -> None:
+    bench_camera.text = bench_camera.text.replace(old, new)
+    bench_camera.play()
     with pytest.raises(SettingRefused, match=f"one frame at each trigger: {reason}.*Use a camera") as caught:
-        used.open().configure(LIGHT)
+        bench_camera.open().configure(LIGHT)
     assert "arv-tool" not in str(caught.value)

@@ -26,7 +26,7 @@ VOLTS = {"low": 1.2, "quarter": 1.53, "half": 2.2, "high": 9.0}
 
 def test_bytes_of_the_controller() -> None:
     emulator = make(ServeOptions(clock=FastClock(instant=True)))
-    for sent, came, volts in (
+    for request, reply, volts in (
         (b"*idn?\r", b"*idn?\rTHORLABS LCC25 VERSION 1.05\r> ", 0.0),
         (b"volt1?\r", b"volt1?\r5.000\r> ", 0.0),
         (b"volt1=1.53\r", b"volt1=1.53\r> ", 0.0),
@@ -41,8 +41,8 @@ def test_bytes_of_the_controller() -> None:
         (b"\r", b"\rCommand error CMD_NOT_DEFINED\r> ", 4.0),
         (b"volt3?\r", b"volt3?\rCommand error CMD_NOT_DEFINED\r> ", 4.0),
     ):
-        emulator.receive(sent)
-        assert (emulator.take_output(), emulator.true_deg()) == (came, volts)
+        emulator.receive(request)
+        assert (emulator.take_output(), emulator.true_deg()) == (reply, volts)
 
 
 class TestLCC25(EmulatorNoise):

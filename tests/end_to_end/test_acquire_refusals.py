@@ -52,7 +52,7 @@ def test_what_is_wrong_in_a_rig_file_is_told_in_a_line(refused, small_rig, chang
 
 
 @pytest.mark.parametrize(
-    ("change", "row", "why"),
+    ("change", "row", "reason"),
     [
         ({"alert": ["/no/such/program"]}, "alert", "no program '/no/such/program'"),
         ({"notify": {"command": ["/no/such/teller"]}}, "notify", "no program '/no/such/teller'"),
@@ -61,7 +61,7 @@ def test_what_is_wrong_in_a_rig_file_is_told_in_a_line(refused, small_rig, chang
     ],
     ids=["alert", "notify", "scene", "truth"],
 )
-def test_what_is_not_on_this_machine_is_told_beside_the_rest(refused, acquire, small_rig, change, row, why):
+def test_what_is_not_on_this_machine_is_told_beside_the_rest(refused, acquire, small_rig, change, row, reason):
     """A rig file of the bench on the desk of somebody else: its checks run, its runs do not."""
     parts = {key: change.pop(key) for key in ("samples", "truth") & change.keys()}
     rig = change_yaml(
@@ -71,7 +71,7 @@ def test_what_is_not_on_this_machine_is_told_beside_the_rest(refused, acquire, s
     assert code == 2
     assert f"REFUSED  {row}" in out
     assert "ok  disc" in out
-    assert why in err
+    assert reason in err
     assert refused("--omega", 35, "--rig", rig)[0] == 2
 
 

@@ -275,8 +275,8 @@ def test_a_cluster_survives_a_capture_that_fails_and_a_worker_that_dies(configs,
         small(tmp_path, configs, "c2", 22)
         code, out, err = process("campaign", tmp_path, "--scheduler", cluster.scheduler_address)
     assert code == 0, err
-    again = [line.split()[1] for line in out.splitlines() if line.startswith("made")]
-    assert again == [str(tmp_path / "campaign/c2.mueller.h5")]
+    remade = [line.split()[1] for line in out.splitlines() if line.startswith("made")]
+    assert remade == [str(tmp_path / "campaign/c2.mueller.h5")]
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
 
 

@@ -54,8 +54,8 @@ def test_the_loop_is_closed(acquire, configs, tmp_path, seed):
 
 
 def test_same_seed_same_faults():
-    first, again, different = (draw_faults(seed, 2, (), 44) for seed in (5, 5, 6))
-    assert first == again != different
+    first, repeat, different = (draw_faults(seed, 2, (), 44) for seed in (5, 5, 6))
+    assert first == repeat != different
 
 
 @pytest.mark.parametrize("kind", drawable())

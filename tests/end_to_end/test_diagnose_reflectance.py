@@ -139,8 +139,8 @@ def test_geometry_and_instrument_that_were_found_end_the_error(configs, scene, t
     instrument = InstrumentModel.load(tmp_path / "new.instrument.yaml")
     with Capture(path) as opened:
         assert opened.header.omega_deg == OMEGA_DEG
-    again = diagnose_object([path], instrument, load_reflectance(material), corrected)[0].diagnosis
-    assert again.verdict == "consistent"
+    second = diagnose_object([path], instrument, load_reflectance(material), corrected)[0].diagnosis
+    assert second.verdict == "consistent"
     assert exit_code(diagnose, path, *options, "--write", new) == 2
 
 

@@ -36,8 +36,8 @@ def test_the_faulty_rig_is_the_simulated_one_with_faults(configs):
     faulty, plain = load_rig(effects_page.RIG), load_rig(configs / "rigs/simulated.yaml")
     effects = faulty.simulator.effects
     assert effects == tuple(FAULTS[kind].example() for kind in effects_page.SWITCHED_ON)
-    same = faulty.simulator.model_copy(update={"effects": (), "rows": 600, "columns": 600})
-    assert faulty.model_copy(update={"simulator": same, "name": plain.name}) == plain
+    simulator = faulty.simulator.model_copy(update={"effects": (), "rows": 600, "columns": 600})
+    assert faulty.model_copy(update={"simulator": simulator, "name": plain.name}) == plain
 
 
 def test_every_commented_fault_can_be_switched_on(tmp_path, configs):

@@ -76,11 +76,11 @@ def check(case: Case, acquire, rig, configs, folder, capfd) -> None:
     code, _, err = acquire("--omega", case.omega, "--sample", case.sample, "--rig", rig, "--out", folder)
     assert code == 0, err
     (capture,) = folder.glob("*.h5")
-    file, new, again = folder / "said.json", folder / "new.yaml", folder / "again.h5"
+    file, new, corrected = folder / "said.json", folder / "new.yaml", folder / "again.h5"
     instrument = configs / "instruments/rgb950.yaml"
     run(diagnose_cli.main, capture, "--instrument", instrument, "--write", new, "--json", file)
     run(process, "reduce", capture, "--no-figure")
-    run(process, "reduce", capture, "--instrument", new, "--out", again, "--no-figure")
+    run(process, "reduce", capture, "--instrument", new, "--out", corrected, "--no-figure")
     report = json.loads(file.read_text())
     names = {(e["kind"], *(n.partition("[")[0] for n in e["indistinguishable_from"])) for e in report["effects"]}
     sure = {e["kind"] for e in report["effects"] if e["answer"] == "sure" and e["confident"]}
@@ -88,7 +88,7 @@ def check(case: Case, acquire, rig, configs, folder, capfd) -> None:
     assert bool(report["effects"]) == bool(case.effects)
     errors = []
     scene = Scene.load(configs / "scenes" / f"{case.sample}.yaml")
-    for product in (capture.with_suffix(".mueller.h5"), again):
+    for product in (capture.with_suffix(".mueller.h5"), corrected):
         xi0 = product.with_suffix(".xi0.h5")
         run(process, "xi0", product, "--out", xi0, "--no-figure")
         errors.append(true_error(product, xi0, scene).mueller_rms)

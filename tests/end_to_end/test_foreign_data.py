@@ -68,9 +68,9 @@ def test_tiffs_and_a_table_with_its_own_columns(configs, tmp_path, process, drr)
     assert process(*command)[0] == 0
     assert mueller_of(process, out) == pytest.approx(SAMPLE, abs=2e-3)
     # The recipe imports it once more, without any other option.
-    again = tmp_path / "again.h5"
-    assert process("import", "--recipe", tmp_path / "sample.import.yaml", "--out", again)[0] == 0
-    with Capture(out) as first, Capture(again) as second:
+    copy = tmp_path / "again.h5"
+    assert process("import", "--recipe", tmp_path / "sample.import.yaml", "--out", copy)[0] == 0
+    with Capture(out) as first, Capture(copy) as second:
         assert np.array_equal(first.frames(7), second.frames(7))
 
 

@@ -27,15 +27,15 @@ LISTENER = "import sys; open(sys.argv[1], 'a').write(sys.argv[2] + '|' + sys.std
 
 
 @pytest.fixture
-def heard(tmp_path):
+def hook(tmp_path):
     """A command that keeps what it is told, and what it has kept."""
     path = tmp_path / "heard"
     command = (sys.executable, "-c", LISTENER, str(path))
     return command, lambda: path.read_text().splitlines() if path.exists() else []
 
 
-def test_end_interlock_and_failure_are_told_to_a_command(heard, tmp_path):
-    command, messages = heard
+def test_end_interlock_and_failure_are_told_to_a_command(hook, tmp_path):
+    command, messages = hook
     with notifying(NotifyConfig(command=command), tmp_path / "c.h5", True) as notifier:
         notifier.warning("a frame was lost")
         notifier.warning("interlock: the door is open; the state is discarded")
@@ -53,8 +53,8 @@ def test_end_interlock_and_failure_are_told_to_a_command(heard, tmp_path):
     assert messages()[2].startswith("failure: psg stalled|")
 
 
-def test_only_what_was_asked_for_is_told_and_a_command_that_fails_harms_nothing(heard, tmp_path):
-    command, messages = heard
+def test_only_what_was_asked_for_is_told_and_a_command_that_fails_harms_nothing(hook, tmp_path):
+    command, messages = hook
     with notifying(NotifyConfig(command=command, on=("failure",)), tmp_path, False) as notifier:
         notifier.tell("end", "complete")
     with notifying(
@@ -67,11 +67,11 @@ def test_only_what_was_asked_for_is_told_and_a_command_that_fails_harms_nothing(
 
 
 def test_a_webhook_gets_the_same_as_json(tmp_path):
-    got = []
+    messages = []
 
     class Hook(http.server.BaseHTTPRequestHandler):
         def do_POST(self):
-            got.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+            messages.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
             self.send_response(204)
             self.end_headers()
 
@@ -84,8 +84,8 @@ def test_a_webhook_gets_the_same_as_json(tmp_path):
         with notifying(NotifyConfig(webhook=f"http://127.0.0.1:{server.server_port}/x"), tmp_path, False) as notifier:
             notifier.tell("end", "done", summary=["72 of 72"])
         thread.join()
-    assert [message["event"] for message in got] == ["end"]
-    assert got[0]["summary"] == ["72 of 72"]
+    assert [message["event"] for message in messages] == ["end"]
+    assert messages[0]["summary"] == ["72 of 72"]
 
 
 def test_the_summary_names_what_is_missing(tmp_path):

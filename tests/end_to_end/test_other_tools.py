@@ -67,11 +67,11 @@ def test_the_lines_in_the_docs_open_both_with_xarray(capture, product, monkeypat
     frames, image = names["frames"], names["image"]
     with frames, image:
         assert frames["data"].dims == ("state", "channel", "y", "x")
-        ours = open_dataset(capture)
-        np.testing.assert_array_equal(frames["data"], ours["counts"])
+        dataset = open_dataset(capture)
+        np.testing.assert_array_equal(frames["data"], dataset["counts"])
         for name in ("psg_deg", "psa_deg", "arm_deg", "exposure_s"):
             assert name in frames["data"].coords
-            np.testing.assert_array_equal(frames[name], ours[name])
+            np.testing.assert_array_equal(frames[name], dataset[name])
         assert image["mueller"].dims == open_dataset(product)["mueller"].dims == ("row", "column", "y", "x")
         np.testing.assert_array_equal(image["mueller_errors"], MuellerImage.load(product).errors)
         assert not [name for name in (*frames.dims, *image.dims) if name.startswith("phony")]

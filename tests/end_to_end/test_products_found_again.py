@@ -234,9 +234,9 @@ def test_campaign_makes_nothing_twice_and_takes_nothing_for_another(original, co
     assert run() == first
     Reduction(folder / "c.h5", weighted=True).make(out / "c.mueller.h5", overwrite=True)
     weighted = (out / "c.mueller.h5").read_bytes()
-    again = run()
-    assert again["c.mueller.h5"] == weighted
-    assert len(again) == 2
+    products = run()
+    assert products["c.mueller.h5"] == weighted
+    assert len(products) == 2
 
 
 def test_a_table_is_not_replaced_and_counts_no_image_twice(capture, configs, process, tmp_path, capfd):

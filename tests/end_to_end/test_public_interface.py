@@ -69,8 +69,8 @@ def test_from_capture_to_labelled_mueller_image_and_back(capture, tmp_path):
     light = raw.where(raw.role == "sample", drop=True)
     assert light.psa_deg.values % 360 == pytest.approx(4.91 * 9 * np.arange(40) % 360, abs=0.01)
     copied = write_dataset(raw, tmp_path / "copy.h5")
-    again = reduce_to_dataset(copied)
-    np.testing.assert_array_equal(again.mueller.values, image.mueller.values)
+    copy = reduce_to_dataset(copied)
+    np.testing.assert_array_equal(copy.mueller.values, image.mueller.values)
     with pytest.raises(ProcessError, match="exists and is not replaced"):
         write_dataset(raw, copied)
     with Capture(capture) as opened, Product(tmp_path / "m.h5") as product:

@@ -124,10 +124,10 @@ def test_axostep_mueller_files(process: Run, capture: Path, tmp_path: Path) -> N
     code, text, err = process("from-axostep", file, "--omega-deg", "35", "--out", back)
     assert code == 0, err
     assert f"{COLUMNS} x {ROWS} pixels, 662 nm" in text
-    with Product(back) as again:
-        np.testing.assert_array_equal(again.get("mueller"), values)
-        assert np.isnan(again.get("mueller_errors")).all()
-        assert again.header.omega_deg == 35
+    with Product(back) as reader:
+        np.testing.assert_array_equal(reader.get("mueller"), values)
+        assert np.isnan(reader.get("mueller_errors")).all()
+        assert reader.header.omega_deg == 35
     code, _, err = process("quantities", back, "--out", tmp_path / "q.h5", "--no-figure")
     assert code == 0, err
     assert "holds no standard errors" in err

@@ -61,7 +61,7 @@ def test_bench_has_its_faults_in_every_capture_and_its_truth_apart(bench):
 def test_intervals_hold_what_the_instrument_file_leaves_uncertain(bench, configs):
     """Declared values are off by more than noise; with a retardance that may be off by five degrees they are within."""
     folder, truth = bench
-    away = folder / "truth" / truth.name
+    truth_folder = folder / "truth" / truth.name
     declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
     five = {"retardance": EffectParameter(value=5.0, unit="degree")}
     uncertain = tuple(
@@ -69,9 +69,9 @@ def test_intervals_hold_what_the_instrument_file_leaves_uncertain(bench, configs
         for axis in ("psg", "psa")
     )
     error = SystematicError(directions=uncertain, rms_over_m00=0.1, wavelength_nm=truth.wavelength_nm)
-    exact = np.load(away / "validation.npy").astype(float)
+    exact = np.load(truth_folder / "validation.npy").astype(float)
     noise, full = (
-        coverage_of(away / "validation_noisy.h5", declared.model_copy(update={"systematic": s}), exact)
+        coverage_of(truth_folder / "validation_noisy.h5", declared.model_copy(update={"systematic": s}), exact)
         for s in ((), (error,))
     )
     assert full.patches > noise.patches + 0.05
@@ -96,9 +96,9 @@ def test_noise_is_the_difference_from_the_twin_without_noise(bench):
 
 def test_true_values_mend_the_validation_sample(bench, configs):
     folder, truth = bench
-    away = folder / "truth" / truth.name
+    truth_folder = folder / "truth" / truth.name
     declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
-    exact = np.load(away / "validation.npy").astype(float)
+    exact = np.load(truth_folder / "validation.npy").astype(float)
     effects = tuple(
         AppliedEffect(
             kind=f.kind,
@@ -109,14 +109,14 @@ def test_true_values_mend_the_validation_sample(bench, configs):
         for f in truth.faults
         if f.capture is None
     )
-    before = Reduced.of(away / "validation.h5", declared).error(exact)
+    before = Reduced.of(truth_folder / "validation.h5", declared).error(exact)
     mended = declared.model_copy(update={"effects": effects})
     assert before > 3e-3
-    assert Reduced.of(away / "validation.h5", mended).error(exact) < before / 20
-    covered = Reduced.of(away / "validation_noisy.h5", mended).coverage(exact)
+    assert Reduced.of(truth_folder / "validation.h5", mended).error(exact) < before / 20
+    covered = Reduced.of(truth_folder / "validation_noisy.h5", mended).coverage(exact)
     # Some thousand values; the few means over patches say less.
     assert covered.pixels == pytest.approx(0.95, abs=0.02)
-    assert Reduced.of(away / "validation_noisy.h5", declared).coverage(exact).patches < 0.8
+    assert Reduced.of(truth_folder / "validation_noisy.h5", declared).coverage(exact).patches < 0.8
 
 
 @pytest.mark.parametrize(
@@ -140,16 +140,19 @@ def test_every_fault_changes_what_a_capture_file_says(group, kind, configs):
     (truth,), *changed = stored([GROUPS[group][kind]])
     assert truth.kind == kind
     _, counts, angles_in_file, declared = stored([])
-    same = [np.array_equal(counts, changed[0]), str(angles_in_file) == str(changed[1]), declared == changed[2]]
-    assert not all(same)
+    equal = [np.array_equal(counts, changed[0]), str(angles_in_file) == str(changed[1]), declared == changed[2]]
+    assert not all(equal)
 
 
 def test_fit_of_the_truth_is_far_better_than_the_declared_instrument(bench, configs):
     folder, truth = bench
-    away = folder / "truth" / truth.name
+    truth_folder = folder / "truth" / truth.name
     declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
-    exact = np.load(away / "validation.npy").astype(float)
-    assert read_oracle(folder, truth, configs, "joint") < Reduced.of(away / "validation.h5", declared).error(exact) / 3
+    exact = np.load(truth_folder / "validation.npy").astype(float)
+    assert (
+        read_oracle(folder, truth, configs, "joint")
+        < Reduced.of(truth_folder / "validation.h5", declared).error(exact) / 3
+    )
 
 
 @pytest.mark.long
@@ -193,11 +196,11 @@ def test_one_undeclared_fault_gets_its_name_or_none(group, role, seed, configs, 
 
 def test_what_cannot_be_reduced_has_an_infinite_error(tmp_path, configs):
     truth = make_bench(tmp_path, list(GROUPS["wiring"]).index("ratio"), configs, "wiring", pixels=16)
-    away = tmp_path / "truth" / truth.name
+    truth_folder = tmp_path / "truth" / truth.name
     declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
-    exact = np.load(away / "validation.npy").astype(float)
-    assert error_of(away / "validation.h5", declared, exact) == np.inf
-    assert np.isnan(coverage_of(away / "validation_noisy.h5", declared, exact).pixels)
+    exact = np.load(truth_folder / "validation.npy").astype(float)
+    assert error_of(truth_folder / "validation.h5", declared, exact) == np.inf
+    assert np.isnan(coverage_of(truth_folder / "validation_noisy.h5", declared, exact).pixels)
 
 
 def truth_of(*faults):

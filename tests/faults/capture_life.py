@@ -188,18 +188,18 @@ class LifeOfACapture(RuleBasedStateMachine):
             done = [int(state) for state in capture.done]
             self.missing = len(capture.planned_column("exposure_s")) - len(done)
             values = [capture.column(name) for name in ("host_time_s", "exposure_s", "segment")]
-            now = {
+            content = {
                 state: capture.frames(k).tobytes() + b"".join(column[k].tobytes() for column in values)
                 for k, state in enumerate(done)
             }
             run_of = dict(zip(done, capture.column("segment"), strict=True))
             runs = len(capture.segments)
             states = [state for segment in capture.segments for state in segment.states]
-        assert {state: now.get(state) for state in self.known} == self.known
-        assert len(self.reported - now.keys()) <= lost, (self.reported, done)
+        assert {state: content.get(state) for state in self.known} == self.known
+        assert len(self.reported - content.keys()) <= lost, (self.reported, done)
         assert len(set(states)) == len(states), states
-        assert {run_of[state] for state in now.keys() - self.known.keys()} <= {runs - 1}
-        self.known, self.reported = now, set(now)
+        assert {run_of[state] for state in content.keys() - self.known.keys()} <= {runs - 1}
+        self.known, self.reported = content, set(content)
 
     @rule()
     def swap_a_device(self) -> None:

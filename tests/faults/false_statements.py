@@ -196,10 +196,10 @@ def main() -> int:
         for seed in range(each):
             with tempfile.TemporaryDirectory() as folder:
                 rows.append(take(kind, seed, Path(folder)))
-        ended, again, reports, warned = (sum(column) for column in zip(*rows, strict=True))
+        ended, retaken, reports, warned = (sum(column) for column in zip(*rows, strict=True))
         passed = sum(not any(row) for row in rows)
         passed_of_first += passed if number < 10 else 0
-        print(f"{kind:<42} {each:>8} {ended:>6} {again:>6} {reports:>8} {warned:>7} {passed:>7}", flush=True)
+        print(f"{kind:<42} {each:>8} {ended:>6} {retaken:>6} {reports:>8} {warned:>7} {passed:>7}", flush=True)
     return int(passed_of_first > 0)
 
 

@@ -74,10 +74,10 @@ def put_elsewhere(rng: random.Random, h5: h5py.File, name: str) -> None:
     if not pipe.exists():
         os.mkfifo(pipe)
     place = rng.choice((str(pipe), "/proc/kmsg", "/dev/zero", "/etc/passwd", str(TRAP)))
-    how = rng.randrange(3)
-    if how == 0:
+    way = rng.randrange(3)
+    if way == 0:
         h5[name] = h5py.ExternalLink(place, "/x")
-    elif how == 1:
+    elif way == 1:
         h5.create_dataset(name, (4,), "u1", external=[(place, 0, 4)])
     else:
         layout = h5py.VirtualLayout((4,), "u1")
@@ -130,16 +130,16 @@ def spoil_text(rng: random.Random, text: str) -> str:
     for _ in range(rng.randint(1, 3)):
         lines = text.splitlines() or [""]
         k = rng.randrange(len(lines))
-        how = rng.randrange(5)
-        if how == 0:
+        way = rng.randrange(5)
+        if way == 0:
             words = lines[k].replace(",", " , ").split(" ")
             words[rng.randrange(len(words))] = rng.choice(ODD_TEXT)
             lines[k] = " ".join(words)
-        elif how == 1:
+        elif way == 1:
             del lines[k]
-        elif how == 2:
+        elif way == 2:
             lines.insert(k, lines[rng.randrange(len(lines))])
-        elif how == 3:
+        elif way == 3:
             at = rng.randint(0, len(lines[k]))
             lines[k] = lines[k][:at] + rng.choice(ODD_TEXT) + lines[k][at:]
         else:
@@ -157,12 +157,12 @@ def spoil_yaml(rng: random.Random, text: str) -> str:
         if place is None:
             break
         node, key = place
-        how = rng.randrange(4)
-        if how == 0 and isinstance(node, dict):
+        way = rng.randrange(4)
+        if way == 0 and isinstance(node, dict):
             node[rng.choice(("amr", "x", 5, ""))] = node.pop(key)
-        elif how == 1:
+        elif way == 1:
             del node[key]
-        elif how == 2 and isinstance(node[key], list) and len(node[key]) > 1:
+        elif way == 2 and isinstance(node[key], list) and len(node[key]) > 1:
             node[key] = node[key][::-1]
         else:
             # A copy: a value that is put into itself has no end.
@@ -192,14 +192,14 @@ def spoil_h5(rng: random.Random, path: Path) -> None:
             names: list[str] = []
             h5.visit(names.append)
             name = rng.choice(names) if names else ""
-            how = rng.randrange(4)
-            if how == 0 and name:
+            way = rng.randrange(4)
+            if way == 0 and name:
                 del h5[name]
-            elif how == 1 and name:
+            elif way == 1 and name:
                 del h5[name]
                 _put_odd(rng, h5, name)
             else:
-                node = h5[name] if name and how == 2 else h5.get("entry", h5)
+                node = h5[name] if name and way == 2 else h5.get("entry", h5)
                 keys = list(node.attrs)
                 key = rng.choice(keys) if keys else "signal"
                 _put_attribute(rng, node, key)

@@ -74,9 +74,9 @@ def run(options: list[str], out: Path, before: Callable[[DiscCalls], None] = lam
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
-        with open(os.devnull, "w") as nothing:
-            os.dup2(nothing.fileno(), 1)
-            os.dup2(nothing.fileno(), 2)
+        with open(os.devnull, "w") as null:
+            os.dup2(null.fileno(), 1)
+            os.dup2(null.fileno(), 2)
         calls, code = DiscCalls(), 70
         before(calls)
         try:
@@ -135,7 +135,7 @@ def check(out: Path, expected: dict[str, bytes]) -> str:
     return "; ".join(wrong)
 
 
-def kill(options: list[str], every: int, first: int, fails: bool) -> int:
+def kill(options: list[str], stride: int, first: int, fails: bool) -> int:
     """Kill before every n-th call, or have it fail, go on, compare."""
     captures = WORK / "captures"
     status, total = run(options, captures / "whole", lambda calls: calls.arm(0))
@@ -143,7 +143,7 @@ def kill(options: list[str], every: int, first: int, fails: bool) -> int:
     expected = contents(captures / "whole")
     lost = points = 0
     begin_s = time.monotonic()
-    for number in range(first, total + 1, every):
+    for number in range(first, total + 1, stride):
         if time.monotonic() - begin_s > LIMIT_S:
             print(f"stopped before call {number}: no time left")
             break
@@ -318,9 +318,9 @@ def image(options: list[str], cuts: int, seed: int = 1) -> int:
         child = os.fork()
         if child == 0:
             os.environ[RECORD] = str(log)
-            with open(os.devnull, "w") as nothing:
-                os.dup2(nothing.fileno(), 1)
-                os.dup2(nothing.fileno(), 2)
+            with open(os.devnull, "w") as null:
+                os.dup2(null.fileno(), 1)
+                os.dup2(null.fileno(), 2)
             calls = DiscCalls()
             _Reported(calls)
             calls.arm(number, signal.SIGSTOP)
@@ -382,10 +382,10 @@ def main() -> None:
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)
     captures = (numbers or [300])[0] if mode == "night" else 1
     options = write_files(WORK, captures)
-    every, first = [*numbers, *(1, 1)[len(numbers) :]][:2] if mode in ("kill", "error") else (1, 1)
+    stride, first = [*numbers, *(1, 1)[len(numbers) :]][:2] if mode in ("kill", "error") else (1, 1)
     work: dict[str, Callable[[], int]] = {
-        "kill": lambda: kill(options, every, first, fails=False),
-        "error": lambda: kill(options, every, first, fails=True),
+        "kill": lambda: kill(options, stride, first, fails=False),
+        "error": lambda: kill(options, stride, first, fails=True),
         "power": lambda: power(options, (numbers or [0])[0]),
         "image": lambda: image(options, (numbers or [200])[0]),
         "night": lambda: night(options, captures, numbers[1] if len(numbers) > 1 else 45),

@@ -10,8 +10,8 @@ SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, 
 
 
 def _at(state, *faults, port="rotators"):
-    def act(rig, now, retake):
-        if now == state and retake == 0:
+    def act(rig, number, retake):
+        if number == state and retake == 0:
             rig.simulation.emulators[port].faults.add(*faults)
 
     return act

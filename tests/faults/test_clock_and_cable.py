@@ -104,11 +104,11 @@ def test_a_machine_that_slept_takes_the_state_again(run_with, intact, monkeypatc
 
 
 def test_a_clock_that_is_only_slewed_is_no_news(monkeypatch):
-    now = Clocks(1e9, 1000.0, 1000.0)
-    monkeypatch.setattr(wall_clock, "read_clocks", lambda: now)
+    clocks = Clocks(1e9, 1000.0, 1000.0)
+    monkeypatch.setattr(wall_clock, "read_clocks", lambda: clocks)
     clock = WallClock()
     for _ in range(200):
-        now = Clocks(now.unix_s + 1.0005, now.with_sleep_s + 1, now.awake_s + 1)
+        clocks = Clocks(clocks.unix_s + 1.0005, clocks.with_sleep_s + 1, clocks.awake_s + 1)
         assert clock.look() is None
     assert clock.ahead_s == pytest.approx(0.1, rel=1e-3)
 

@@ -202,9 +202,9 @@ def test_resume_goes_to_the_first_missing_state_by_an_allowed_way(rig_with, tmp_
         session.take(job, rig, tmp_path / "run.h5", stop, observers=[StopThere()])
         steps = watch(rig)
         path = next(tmp_path.glob("run.h5*"))
-        again = job_of(path, config)
-        refuse_failed(check_with_devices(again, rig, tmp_path))
-        result = session.resume(again, rig, path, StopRequest())
+        resumed_job = job_of(path, config)
+        refuse_failed(check_with_devices(resumed_job, rig, tmp_path))
+        result = session.resume(resumed_job, rig, path, StopRequest())
     assert (result.status, result.states_done) == ("complete", 9)
     assert not any(meets(BLOCK, *step) for step in steps)
 

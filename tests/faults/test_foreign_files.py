@@ -18,7 +18,7 @@ def nobody(monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def theirs(run_with, tmp_path):
+def foreign_capture(run_with, tmp_path):
     """A partial capture whose rig calls a command and writes a transcript; the rig file itself is gone."""
 
     def act(rig, state, retake):
@@ -41,27 +41,27 @@ def unused(tmp_path):
 
 
 @pytest.mark.parametrize("more", [(), ("--as-new",)])
-def test_a_capture_is_resumed_with_a_rig_file_of_ones_own_only(nobody, theirs, acquire, tmp_path, more):
-    before = theirs.read_bytes()
-    code, _, err = acquire("--resume", theirs, *more)
+def test_a_capture_is_resumed_with_a_rig_file_of_ones_own_only(nobody, foreign_capture, acquire, tmp_path, more):
+    before = foreign_capture.read_bytes()
+    code, _, err = acquire("--resume", foreign_capture, *more)
     assert code == 2, err
-    assert " ".join(("acquire --resume", str(theirs), "--rig RIG.yaml", *more)) in err
-    assert theirs.read_bytes() == before
+    assert " ".join(("acquire --resume", str(foreign_capture), "--rig RIG.yaml", *more)) in err
+    assert foreign_capture.read_bytes() == before
     assert unused(tmp_path)
 
 
-def test_the_own_rig_file_says_what_is_run(nobody, theirs, acquire, tmp_path):
+def test_the_own_rig_file_says_what_is_run(nobody, foreign_capture, acquire, tmp_path):
     """The rig of the same name that was used before, although the file's own names other commands."""
     yaml = YAML()
     rig = yaml.load(tmp_path / "gone.yaml")
-    mine = ["/bin/sh", "-c", f"touch {tmp_path / 'mine_was_run'}"]
-    rig |= {"notify": {"command": mine}, "alert": []}
+    command = ["/bin/sh", "-c", f"touch {tmp_path / 'mine_was_run'}"]
+    rig |= {"notify": {"command": command}, "alert": []}
     del rig["wire_log"]
     yaml.dump(rig, tmp_path / "mine.yaml")
-    code, out, err = acquire("--resume", theirs, "--rig", tmp_path / "mine.yaml", "--dry-run")
+    code, out, err = acquire("--resume", foreign_capture, "--rig", tmp_path / "mine.yaml", "--dry-run")
     assert code == 0, out + err
     assert is_own_rig(tmp_path / "mine.yaml")
-    code, out, err = acquire("--resume", theirs)
+    code, out, err = acquire("--resume", foreign_capture)
     assert code == 0, out + err
     assert (tmp_path / "mine_was_run").exists()
     assert unused(tmp_path)

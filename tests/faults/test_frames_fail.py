@@ -203,19 +203,19 @@ def test_exposures_that_nobody_asked_for_never_enter_a_capture(run_with, intact)
 
 def altered(first, alter):
     """An action that has the camera hand out something else from a state on: `alter` of a frame and the one before."""
-    now = {"state": -1, "before": None}
+    memory = {"state": -1, "before": None}
 
     def act(rig, state, retake):
-        now["state"] = state
+        memory["state"] = state
         camera = rig.require_camera()
-        if now["before"] is None and "take" not in now:
-            now["take"] = camera._do_frame
+        if memory["before"] is None and "take" not in memory:
+            memory["take"] = camera._do_frame
 
             def taken():
-                frame = now["take"]()
-                if now["state"] >= first and now["before"] is not None:
-                    frame = replace(frame, **alter(frame, now["before"]))
-                now["before"] = frame
+                frame = memory["take"]()
+                if memory["state"] >= first and memory["before"] is not None:
+                    frame = replace(frame, **alter(frame, memory["before"]))
+                memory["before"] = frame
                 return frame
 
             camera._do_frame = taken

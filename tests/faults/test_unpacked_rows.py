@@ -84,12 +84,12 @@ def test_bytes_that_are_noise_are_stored_and_every_reader_finds_the_values(write
         _, stream = h5["packed"].id.read_direct_chunk((1, 1, 16, 0))
         # The first bytes of the chunk's values stand in its stream as they are.
         assert values[1, 1, 16:32].tobytes()[::4] in stream
-        every = packing.create_packed(h5, "every", values.shape, np.float32)
-        packing.pack(h5["plain"], every, packing.Packing(1.0, (True,) * 4))
+        dataset = packing.create_packed(h5, "every", values.shape, np.float32)
+        packing.pack(h5["plain"], dataset, packing.Packing(1.0, (True,) * 4))
         for name in ("packed", "every"):
             np.testing.assert_array_equal(h5[name][...], values)
             np.testing.assert_array_equal(read_rows(h5[name], slice(None)), values)
-        assert h5["packed"].id.get_storage_size() < 1.05 * every.id.get_storage_size()
+        assert h5["packed"].id.get_storage_size() < 1.05 * dataset.id.get_storage_size()
         size = h5["plain"].nbytes / best.ratio
         assert h5["packed"].id.get_storage_size() == pytest.approx(size, rel=0.15)
 

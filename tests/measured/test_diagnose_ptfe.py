@@ -110,9 +110,9 @@ def problem_of(public_files, wavelength_um):
 @pytest.mark.parametrize("wavelength_um", FOUND)
 def test_scattering_in_the_volume_helps_and_polarized_diffuse_does_not(public_files, wavelength_um):
     problem = problem_of(public_files, wavelength_um)
-    nothing = Space(())
-    fit = minimize(problem, nothing, np.zeros(0))
-    before = held_out(problem, nothing, fit)
+    empty = Space(())
+    fit = minimize(problem, empty, np.zeros(0))
+    before = held_out(problem, empty, fit)
     alone = {}
     for candidate in problem.pool():
         if candidate.kind in ("volume_scattering", "polarized_diffuse"):

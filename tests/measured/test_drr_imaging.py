@@ -76,15 +76,15 @@ def test_mirror_gives_the_train(public_files, configs: Path, tmp_path: Path) -> 
     assert train["psa_retarder.retardance_deg"] == pytest.approx(72.4, abs=0.1)
     assert result.residual_over_mean == pytest.approx(0.014, abs=0.0005)
     # The authors' own fit of the same frames: zeros are subtracted there, and modulo 90 degrees for a retarder.
-    theirs = scipy.io.loadmat(str(files["calibration_reflexion.mat"]))
+    calibration = scipy.io.loadmat(str(files["calibration_reflexion.mat"]))
     for name, key, period in (
         ("analyzer.azimuth_deg", "theta_0_a", 180),
         ("psg_retarder.azimuth_deg", "alpha_0_g", 90),
         ("psa_retarder.azimuth_deg", "alpha_0_a", 90),
     ):
-        difference = (train[name] + theirs[key].item() + period / 2) % period - period / 2
+        difference = (train[name] + calibration[key].item() + period / 2) % period - period / 2
         assert abs(difference) < 0.2, name
     for name, end in (("psg", "g"), ("psa", "a")):
-        k1, k2 = theirs[f"k_1_{end}"].item(), theirs[f"k_2_{end}"].item()
+        k1, k2 = calibration[f"k_1_{end}"].item(), calibration[f"k_2_{end}"].item()
         expected = np.rad2deg(k1 / 630 + k2 / 630**3)
         assert train[f"{name}_retarder.retardance_deg"] == pytest.approx(expected, abs=0.3)

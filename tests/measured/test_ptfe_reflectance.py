@@ -58,8 +58,8 @@ FOUND = {
 @pytest.mark.parametrize("wavelength_um", WAVELENGTHS_UM)
 def test_how_much_of_the_polarized_light_the_model_takes(rows, wavelength_um):
     geometry, m = in_facet_axes(rows, wavelength_um)
-    every = np.tile(np.eye(16), (len(m), 1, 1))
-    fit = fit_values(geometry, m.reshape(-1, 16).T, np.eye(16), every, max_pixels=len(m), correlation=True)
+    unit = np.tile(np.eye(16), (len(m), 1, 1))
+    fit = fit_values(geometry, m.reshape(-1, 16).T, np.eye(16), unit, max_pixels=len(m), correlation=True)
     best = explained(m, fit.model("PTFE", 1000 * wavelength_um).mueller_jones(geometry, 1000 * wavelength_um))
     fraction = explained(m, xi0_and_dominant(m)[1])
     plain = first_surface.Model(name="PTFE", constants={633: first_surface.Constants(n=1.35)})

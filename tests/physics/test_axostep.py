@@ -65,9 +65,9 @@ def test_mueller_image_byte_by_byte(tmp_path: Path) -> None:
         assert image.date is not None
         assert (image.date - datetime(1904, 1, 1, tzinfo=UTC)).total_seconds() == seconds
         assert image.trailer == b"\x00\x01\x02\x03"
-        again = tmp_path / "b.cmmi"
-        write_mueller_file(again, image)
-        assert again.read_bytes() == file.read_bytes()
+        copy = tmp_path / "b.cmmi"
+        write_mueller_file(copy, image)
+        assert copy.read_bytes() == file.read_bytes()
 
 
 def test_the_labs_own_indexing_of_a_square_image(tmp_path: Path) -> None:
@@ -96,12 +96,12 @@ def test_round_trip(
     )
     file = tmp_path_factory.mktemp("axostep") / ("x.bmmi" if plain else "x.cmmi")
     write_mueller_file(file, image)
-    again = read_mueller_file(file)
-    np.testing.assert_array_equal(again.mueller, image.mueller)
-    np.testing.assert_array_equal(again.reduced, image.reduced)
-    assert again.metadata["wavelength_nm"] == 662
-    assert again.date == image.date
-    assert again.header_words == header_words
+    copy = read_mueller_file(file)
+    np.testing.assert_array_equal(copy.mueller, image.mueller)
+    np.testing.assert_array_equal(copy.reduced, image.reduced)
+    assert copy.metadata["wavelength_nm"] == 662
+    assert copy.date == image.date
+    assert copy.header_words == header_words
 
 
 def test_what_is_refused(tmp_path: Path) -> None:

@@ -89,10 +89,10 @@ def test_fault_is_the_effect(configs, fault, kind, place, values):
     effect = instrument_effects()[kind]
     effect.apply(changes, model, place, np.array(values, dtype=float))
     want = 1e4 * model.rows(ANGLES, changes)[:, 0] @ GLASS.reshape(16)
-    got = series(true_bench)[:, 0, 0]
+    electrons = series(true_bench)[:, 0, 0]
     plain = series(bench(configs)[0])[:, 0, 0]
-    assert np.abs(got - plain).max() > 1e-3 * plain.max()
-    np.testing.assert_allclose(got, want, rtol=2e-5, atol=2e-5 * plain.max())
+    assert np.abs(electrons - plain).max() > 1e-3 * plain.max()
+    np.testing.assert_allclose(electrons, want, rtol=2e-5, atol=2e-5 * plain.max())
 
 
 def test_field_retardance_is_another_retarder_in_every_pixel(configs):
@@ -101,8 +101,8 @@ def test_field_retardance_is_another_retarder_in_every_pixel(configs):
     for row, column in ((0, 0), (4, 8), (8, 3)):
         x, y = -1 + column / 4, -1 + row / 4
         offset = 3.0 * ((x - 0.5) ** 2 + y**2)
-        same, _ = bench(configs, {"kind": "element_error", "element": "psg_retarder", "offset": offset})
-        np.testing.assert_allclose(image[:, row, column], series(same)[:, 0, 0], rtol=1e-4, atol=1.0)
+        pixel_bench, _ = bench(configs, {"kind": "element_error", "element": "psg_retarder", "offset": offset})
+        np.testing.assert_allclose(image[:, row, column], series(pixel_bench)[:, 0, 0], rtol=1e-4, atol=1.0)
 
 
 def test_play_is_taken_up_before_the_shaft_follows(configs):

@@ -63,8 +63,8 @@ def parts_of(model: InstrumentModel, seed: int) -> list[KnownCapture]:
 @pytest.fixture(scope="module")
 def repeated():
     """Fits with curves and with a value at each wavelength, of the same noisy captures."""
-    every = [parts_of(plates(), seed) for seed in range(5)]
-    return [(fit_curves(parts, FREE, 3), fit_trains(parts, FREE)) for parts in every]
+    captures = [parts_of(plates(), seed) for seed in range(5)]
+    return [(fit_curves(parts, FREE, 3), fit_trains(parts, FREE)) for parts in captures]
 
 
 @pytest.mark.long

@@ -108,8 +108,8 @@ def test_layout_and_type_do_not_matter() -> None:
     xi0, m0 = xi0_and_dominant(m)
     planar = np.ascontiguousarray(np.moveaxis(m, (-2, -1), (0, 1)))
     for view in (np.moveaxis(planar, (0, 1), (-2, -1)), np.swapaxes(np.swapaxes(m, 0, 1).copy(), 0, 1)):
-        again, m0_again = xi0_and_dominant(view)
-        np.testing.assert_array_equal(again, xi0)
+        xi0_of_view, m0_again = xi0_and_dominant(view)
+        np.testing.assert_array_equal(xi0_of_view, xi0)
         np.testing.assert_array_equal(m0_again, m0)
     single, m0_single = xi0_and_dominant(m.astype(np.float32))
     assert single.dtype == m0_single.dtype == np.float32

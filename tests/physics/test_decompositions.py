@@ -43,39 +43,39 @@ def peers() -> dict[str, Any]:
 class TestOthersPackages:
     def test_lu_chipman_of_positive_determinants(self, peers: dict[str, Any]) -> None:
         m = np.array(peers["matrices"])
-        ours = lu_chipman(m)
+        factors = lu_chipman(m)
         good = np.linalg.det(m) > 0
         assert good.sum() == 12
         for package in ("py_pol", "muellerkit"):
             for factor in ("depolarizer", "retarder", "diattenuator"):
-                theirs = np.array(peers["packages"][package][factor])
-                np.testing.assert_allclose(getattr(ours, factor)[good], theirs[good], atol=4e-13)
+                peer = np.array(peers["packages"][package][factor])
+                np.testing.assert_allclose(getattr(factors, factor)[good], peer[good], atol=4e-13)
         katsu = np.array(peers["packages"]["katsu"]["factors"])
         for k, factor in enumerate(("depolarizer", "retarder", "diattenuator")):
-            np.testing.assert_allclose(getattr(ours, factor)[good], katsu[good, k], atol=4e-13)
+            np.testing.assert_allclose(getattr(factors, factor)[good], katsu[good, k], atol=4e-13)
         d = quantities.magnitude(quantities.diattenuation_vector(m))
         np.testing.assert_allclose(d, peers["packages"]["pymueller"]["answers"][0], atol=1e-14)
 
     def test_lu_chipman_of_negative_determinants(self, peers: dict[str, Any]) -> None:
         m = np.array(peers["matrices"])
-        ours = lu_chipman(m)
-        bad = ours.negative_determinant
+        factors = lu_chipman(m)
+        bad = factors.negative_determinant
         assert bad.sum() == 4
         kit = peers["packages"]["muellerkit"]
         for factor in ("depolarizer", "retarder", "diattenuator"):
-            np.testing.assert_allclose(getattr(ours, factor)[bad], np.array(kit[factor])[bad], atol=4e-13)
+            np.testing.assert_allclose(getattr(factors, factor)[bad], np.array(kit[factor])[bad], atol=4e-13)
         katsu = np.array(peers["packages"]["katsu"]["factors"])
         np.testing.assert_allclose(np.linalg.det(katsu[bad, 1]), -1, atol=1e-9)
-        np.testing.assert_allclose(katsu[bad, 1, 1:, 1:], -ours.retarder[bad, 1:, 1:], atol=1e-9)
+        np.testing.assert_allclose(katsu[bad, 1, 1:, 1:], -factors.retarder[bad, 1:, 1:], atol=1e-9)
         py_pol = np.array(peers["packages"]["py_pol"]["retarder"])
-        np.testing.assert_allclose(py_pol[bad], -ours.retarder[bad], atol=1e-9)
+        np.testing.assert_allclose(py_pol[bad], -factors.retarder[bad], atol=1e-9)
 
     def test_scalars(self, peers: dict[str, Any]) -> None:
         m = np.array(peers["matrices"])
-        ours, packages = lu_chipman(m), peers["packages"]
-        retardance = quantities.magnitude(quantities.retardance_vector(ours.retarder))
+        factors, packages = lu_chipman(m), peers["packages"]
+        retardance = quantities.magnitude(quantities.retardance_vector(factors.retarder))
         np.testing.assert_allclose(retardance, packages["muellerkit"]["total_retardance_rad"], atol=1e-12)
-        power = depolarization_power(ours.depolarizer)
+        power = depolarization_power(factors.depolarizer)
         np.testing.assert_allclose(power, packages["muellerkit"]["depolarization_power"], atol=1e-12)
         index = np.sqrt(1 - quantities.depolarization_index(m) ** 2)
         np.testing.assert_allclose(index, packages["py_pol"]["depolarization_index"], atol=1e-12)
@@ -124,8 +124,8 @@ class TestLuChipman:
             np.testing.assert_allclose(quantities.magnitude(vector), 1.3, atol=1e-12)
 
     def test_where_it_is_not_defined(self) -> None:
-        nothing = np.full((4, 4), np.nan)
-        cases = np.stack([mueller.polarizer(0.3), mueller.IDEAL_DEPOLARIZER, np.zeros((4, 4)), nothing, np.eye(4)])
+        invalid = np.full((4, 4), np.nan)
+        cases = np.stack([mueller.polarizer(0.3), mueller.IDEAL_DEPOLARIZER, np.zeros((4, 4)), invalid, np.eye(4)])
         factors = lu_chipman(cases)
         np.testing.assert_array_equal(factors.defined, [False, False, False, False, True])
         assert np.isnan(factors.retarder[:4]).all()
@@ -274,8 +274,8 @@ class TestDifferential:
         np.testing.assert_allclose(generators.mean, l_matrix, atol=1e-7)
 
     def test_where_it_is_not_defined(self) -> None:
-        nothing = np.full((4, 4), np.nan)
-        cases = [mueller.polarizer(0.3), mueller.IDEAL_MIRROR, mueller.retarder(0.2, np.pi), np.zeros((4, 4)), nothing]
+        invalid = np.full((4, 4), np.nan)
+        cases = [mueller.polarizer(0.3), mueller.IDEAL_MIRROR, mueller.retarder(0.2, np.pi), np.zeros((4, 4)), invalid]
         generators = differential(np.stack(cases))
         assert not generators.defined.any()
         assert np.isnan(generators.mean).all()

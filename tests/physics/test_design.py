@@ -80,8 +80,8 @@ def test_optimizing_finds_better_retardances_and_ratios() -> None:
     assert (ratio.generator_retardance_deg, ratio.analyzer_retardance_deg) == pytest.approx((127.12, 94.78))
     assert ratio.score.equally_weighted_variance < 86.3
     table = ratio.table(("psg", "psa"))
-    again = score(MODEL.rows(table.angles_deg), NOISE)
-    assert again.equally_weighted_variance == pytest.approx(ratio.score.equally_weighted_variance)
+    figures = score(MODEL.rows(table.angles_deg), NOISE)
+    assert figures.equally_weighted_variance == pytest.approx(ratio.score.equally_weighted_variance)
     for design in (retardances, ratio):
         assert design.score.equally_weighted_variance > design.score.bound
 
@@ -115,8 +115,8 @@ def test_command(configs: Path, tmp_path: Path) -> None:
     assert shown.exit_code == 0, shown.output
     assert "condition number 7.142" in shown.output
     assert "equally weighted variance 86.33; the bound for 40 intensities is 40" in shown.output
-    again = CliRunner().invoke(app, ["design", instrument, "--wavelength", "662", "--table", str(table)])
-    assert again.output.splitlines()[1:] == shown.output.splitlines()[1:-1]
+    repeat = CliRunner().invoke(app, ["design", instrument, "--wavelength", "662", "--table", str(table)])
+    assert repeat.output.splitlines()[1:] == shown.output.splitlines()[1:-1]
     best = CliRunner().invoke(app, ["design", instrument, "--wavelength", "662", "--optimize", "retardances"])
     assert "retardances 130.4 (generator) and 131.6 degrees (analyzer)" in best.output
     wrong = CliRunner().invoke(app, ["design", instrument])

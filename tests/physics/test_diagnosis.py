@@ -147,8 +147,8 @@ def test_a_small_effect_beside_an_image_that_wanders_by_a_pixel(configs, tmp_pat
         assert value.value == pytest.approx(true, abs=3.5 * value.stderr)
     # What is written is consistent the next time.
     write_instrument(tmp_path / "new.yaml", InstrumentModel.load(configs / "instruments/rgb950.yaml"), diagnosis)
-    again = diagnose_captures([path], InstrumentModel.load(tmp_path / "new.yaml"))[0].diagnosis
-    assert again.verdict == "consistent"
+    second = diagnose_captures([path], InstrumentModel.load(tmp_path / "new.yaml"))[0].diagnosis
+    assert second.verdict == "consistent"
 
 
 @pytest.mark.long

@@ -128,8 +128,8 @@ def test_an_offset_that_nothing_else_shows_leaves_the_noise_of_the_light(configs
     bench = TrueBench(rows=SIDE, columns=SIDE, read_noise=3.0)
     bench.stored.append(lambda stored: stored + 60)
     model, data = captured(tmp_path, configs, bench, RoundSample)
-    problem, nothing = InstrumentProblem(model, [data]), Space(())
-    problem.level_noise(nothing, np.zeros(0))
+    problem, empty = InstrumentProblem(model, [data]), Space(())
+    problem.level_noise(empty, np.zeros(0))
     (leveled,) = problem.still
     assert leveled.slope == pytest.approx(data.slope, rel=0.015)
 

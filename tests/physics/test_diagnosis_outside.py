@@ -70,8 +70,8 @@ def sure(diagnosis: Diagnosis) -> list[str]:
 
 def sentences(diagnosis: Diagnosis) -> list[str]:
     """What is named, or could be, that has no name in the list."""
-    every = [f"{e.kind}[{e.element}]" for e in diagnosis.effects] + [n for e in diagnosis.effects for n in e.could_be]
-    return [name.partition("[")[2].rstrip("]") for name in every if name.startswith("unlisted")]
+    names = [f"{e.kind}[{e.element}]" for e in diagnosis.effects] + [n for e in diagnosis.effects for n in e.could_be]
+    return [name.partition("[")[2].rstrip("]") for name in names if name.startswith("unlisted")]
 
 
 @pytest.mark.long
@@ -131,21 +131,21 @@ def test_every_sentence_is_read_back_from_its_text(configs):
     angles = state_angles(STATES, False, False)
     conditions = Conditions.of({axis: np.rad2deg(angle) for axis, angle in angles.items()})
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
-    every = sentences_of(model, conditions)
-    for sentence in every:
+    candidates = sentences_of(model, conditions)
+    for sentence in candidates:
         assert parse_sentence(sentence.text) == sentence
-    assert "azimuth of analyzer from state 5" in [s.text for s in every]
+    assert "azimuth of analyzer from state 5" in [s.text for s in candidates]
 
 
 def test_a_sentence_is_the_less_likely_the_more_there_are_of_its_kind(configs):
     angles = state_angles(STATES, False, False)
     conditions = Conditions.of({axis: np.rad2deg(angle) for axis, angle in angles.items()})
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
-    every = {s.text: s.price(conditions) for s in sentences_of(model, conditions)}
-    lag = every["lag of detector"]
-    assert every["stray of detector by 4 x psg"] > every["stray of detector by 2 x psg"] == lag
+    prices = {s.text: s.price(conditions) for s in sentences_of(model, conditions)}
+    lag = prices["lag of detector"]
+    assert prices["stray of detector by 4 x psg"] > prices["stray of detector by 2 x psg"] == lag
     for kind in ("gain of source from state", "gain of source beating"):
-        group = [price for text, price in every.items() if text.startswith(kind)]
+        group = [price for text, price in prices.items() if text.startswith(kind)]
         assert np.exp(lag - np.array(group)).sum() == pytest.approx(1, abs=0.1)
 
 

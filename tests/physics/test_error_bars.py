@@ -136,12 +136,12 @@ def test_intervals_of_singular_values_cover_at_every_gap(
 @pytest.mark.parametrize("quantity", ["symmetric_d1", "symmetric_d2", "symmetric_d3", "eigenvalue_deviation"])
 def test_sorted_numbers_have_intervals_and_pulls_within_the_limits(quantity: str) -> None:
     """Elements of the symmetric decomposition covered 96 to 100 %; pulls of deviations over an even error were 1.3."""
-    mine = [c for c in cells("RGB950's 40", 1, 20_000, 1000, extra=EXTRA) if c.quantity == quantity]
-    assert len(mine) >= 12
+    rows = [c for c in cells("RGB950's 40", 1, 20_000, 1000, extra=EXTRA) if c.quantity == quantity]
+    assert len(rows) >= 12
     # The table is smooth: the smaller two of three equal ones cover 97 to 99 %.
-    assert sum(verdicts(c, 1000)[:2] == ("in", "in") for c in mine) >= 9
-    assert not any("low" in verdicts(c, 1000) for c in mine)
-    assert all(0.65 < c.rms < 1.15 for c in mine)
+    assert sum(verdicts(c, 1000)[:2] == ("in", "in") for c in rows) >= 9
+    assert not any("low" in verdicts(c, 1000) for c in rows)
+    assert all(0.65 < c.rms < 1.15 for c in rows)
 
 
 @pytest.mark.parametrize(("electrons", "sample"), [(2000, "det < 0"), (200, "polarizer 1:10")])
@@ -200,8 +200,8 @@ def test_the_joint_region_of_the_retardance_vector_covers_at_180_degrees_too(deg
     covariance = np.moveaxis(packed[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3, -1), -1, 0)
     inverse = np.linalg.inv(covariance.astype(float))
     # The same retarder, turned the other way round.
-    same = (truth, truth - 360 * truth / np.linalg.norm(truth))
-    errors = [maps["retardance_vector_deg"].reshape(3, -1) - vector for vector in same]
+    aliases = (truth, truth - 360 * truth / np.linalg.norm(truth))
+    errors = [maps["retardance_vector_deg"].reshape(3, -1) - vector for vector in aliases]
     distance = np.min([np.einsum("ip,pij,jp->p", error, inverse, error) for error in errors], axis=0)
     # Chi-square of three degrees of freedom.
     assert np.mean(distance) == pytest.approx(3, abs=0.5)
@@ -234,20 +234,20 @@ def test_noise_that_differs_between_directions_is_known(quantity: str) -> None:
     """With states of condition 80 the covariance left out m00, and 68 and 95 % intervals covered 58 and 84 to 90 %."""
     samples = ["mirror-like", "det < 0", "DoLP 0.2", "triply degenerate"]
     table = list(cells("24 others", 0, 20_000, 1000, samples=samples, extra=()))
-    mine = [cell for cell in table if cell.quantity == quantity]
-    assert len(mine) == 4
-    assert min(cell.in_68 for cell in mine) > 0.6
-    assert min(cell.in_95 for cell in mine) > 0.915
+    rows = [cell for cell in table if cell.quantity == quantity]
+    assert len(rows) == 4
+    assert min(cell.in_68 for cell in rows) > 0.6
+    assert min(cell.in_95 for cell in rows) > 0.915
 
 
 @pytest.mark.parametrize(("instrument", "electrons"), [("RGB950's 40", 60), ("RGB950's 40", 2000), ("24 others", 60)])
 def test_entropy_covers_at_both_its_ends_and_where_an_eigenvalue_may_be_zero(instrument: str, electrons: float) -> None:
     """95 % intervals covered 87 to 89 % in all three; a pure sample's estimate was above the truth by its error."""
-    mine = [c for c in cells(instrument, 0, electrons, 400, extra=(), first_seed=21) if c.quantity == "entropy"]
-    assert len(mine) == 19
-    assert min(cell.in_95 for cell in mine) > 0.95 - 4 * np.sqrt(0.95 * 0.05 / 400)
+    rows = [c for c in cells(instrument, 0, electrons, 400, extra=(), first_seed=21) if c.quantity == "entropy"]
+    assert len(rows) == 19
+    assert min(cell.in_95 for cell in rows) > 0.95 - 4 * np.sqrt(0.95 * 0.05 / 400)
     # Where the interval is everything the pulls are smaller.
-    assert electrons == 60 or np.median([cell.rms for cell in mine]) == pytest.approx(1, abs=0.1)
+    assert electrons == 60 or np.median([cell.rms for cell in rows]) == pytest.approx(1, abs=0.1)
 
 
 def test_an_axis_that_is_not_determined_has_its_whole_period_about_its_value() -> None:

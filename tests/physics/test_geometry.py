@@ -46,16 +46,16 @@ def rusinkiewicz_by_rotation(n: np.ndarray, wi: np.ndarray, wo: np.ndarray) -> t
 
 def test_rusinkiewicz_angles_equal_the_definition_by_rotations():
     n, wi, wo = random_directions(200)
-    ours = np.stack(rusinkiewicz.angles(n, wi, wo), axis=-1)
+    angles = np.stack(rusinkiewicz.angles(n, wi, wo), axis=-1)
     reference = np.array([rusinkiewicz_by_rotation(*row) for row in zip(n, wi, wo, strict=True)])
-    np.testing.assert_allclose(ours, reference, atol=1e-7)
+    np.testing.assert_allclose(angles, reference, atol=1e-7)
 
 
 def test_directions_is_the_inverse_of_angles():
     rng = np.random.default_rng(1)
     truth = rng.uniform([0.01, 0.01, -3.1], [1.2, 1.2, 3.1], size=(100, 3))
-    got = rusinkiewicz.angles(*rusinkiewicz.directions(*truth.T))
-    np.testing.assert_allclose(np.stack(got, axis=-1), truth, atol=1e-12)
+    angles = rusinkiewicz.angles(*rusinkiewicz.directions(*truth.T))
+    np.testing.assert_allclose(np.stack(angles, axis=-1), truth, atol=1e-12)
 
 
 def test_angles_are_finite_where_phi_d_is_undefined():

@@ -158,9 +158,9 @@ def test_calibrate_writes_what_it_does_not_know(synthetic_capture, configs, tmp_
     assert set(model.stderr) == set(free.split(","))
     assert 0.005 < model.stderr["psg_retarder.retardance_deg"] < 0.5
     assert abs(model.value_of("psg_retarder.retardance_deg") - 127.12) < 4 * model.stderr["psg_retarder.retardance_deg"]
-    again = InstrumentModel.load(twice)
-    assert again.at(662).stderr == model.stderr
-    assert len(again.correlations) == 1
+    second = InstrumentModel.load(twice)
+    assert second.at(662).stderr == model.stderr
+    assert len(second.correlations) == 1
     paths = products(synthetic_capture, tmp_path, model, model, None)
     with Product(paths[1]) as product:
         assert "psg_retarder.retardance_deg" in product.facts["uncertain_in_the_instrument"]
@@ -235,8 +235,8 @@ def test_what_two_instruments_do_to_a_table_adds_as_squares(stated, synthetic_ca
         assert u_systematic(2, 0, 3) == pytest.approx(alone * np.sqrt(5) / 3, rel=1e-4, abs=1e-9)
     view = ViewingGeometry.load(geometry)
     of_a, of_b, of_c = (tabulate([paths[k][2]], geometry, "degree") for k in range(3))
-    same, independent = (compare_on_sphere(of_a, table, view, 35.0, shape=(32, 32)) for table in (of_b, of_c))
-    assert same["xi0_systematic_percent"] == pytest.approx(0, abs=1e-6)
+    shared, independent = (compare_on_sphere(of_a, table, view, 35.0, shape=(32, 32)) for table in (of_b, of_c))
+    assert shared["xi0_systematic_percent"] == pytest.approx(0, abs=1e-6)
     size = 100 * np.sqrt(2 * np.mean(np.square(of_a.uncertainties["u_systematic"])))
     assert independent["xi0_systematic_percent"] == pytest.approx(size, rel=0.2)
 

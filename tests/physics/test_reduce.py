@@ -333,8 +333,8 @@ def test_killed_reduction_leaves_a_partial_file_that_is_resumed(
         reduce_mueller(capture, rgb950, out, (STEP,))
     assert min(read) == done
     expected = reduced(path, rgb950)
-    again = MuellerImage.load(out)
-    np.testing.assert_array_equal(again.values, expected.values)
-    np.testing.assert_array_equal(again.errors, expected.errors)
-    np.testing.assert_array_equal(again.mask, expected.mask)
-    assert again.facts == expected.facts
+    resumed = MuellerImage.load(out)
+    np.testing.assert_array_equal(resumed.values, expected.values)
+    np.testing.assert_array_equal(resumed.errors, expected.errors)
+    np.testing.assert_array_equal(resumed.mask, expected.mask)
+    assert resumed.facts == expected.facts

@@ -148,5 +148,5 @@ def test_a_product_holds_the_directions_that_its_errors_are_made_of(air, configs
         values = product.get("mueller").reshape(16, -1)
     moves = list(systematic.moves(values))
     assert np.abs(moves[0]).max() > 0.001 * values[0].mean()
-    again = systematic.errors(values).reshape(stored["mueller_systematic"].shape)
-    assert again == pytest.approx(stored["mueller_systematic"], rel=1e-3, abs=1e-3)
+    errors = systematic.errors(values).reshape(stored["mueller_systematic"].shape)
+    assert errors == pytest.approx(stored["mueller_systematic"], rel=1e-3, abs=1e-3)

@@ -243,10 +243,10 @@ def test_empty_bins_take_the_nearest_value_around_the_circle():
     dense, gaps = pbsdf.fill_bins(table, table.mean, 1.0, "nearest")
     _, cos_i, _ = pbsdf.bin_centres()
     i, j = round(90 * np.sqrt(10 / 90)), 20
-    got = dense[:, j, i, 0, 0] * np.pi * cos_i[i, j]
+    values = dense[:, j, i, 0, 0] * np.pi * cos_i[i, j]
     assert 0.999 < gaps < 1
     # phi_d = -170 is 11 degrees from 179, the other way round.
-    assert got[[10, 180, 350, 0, 360]] == pytest.approx([1, 2, 1, 1, 1])
+    assert values[[10, 180, 350, 0, 360]] == pytest.approx([1, 2, 1, 1, 1])
     assert np.isnan(dense[0, 90, 45]).all()
 
 

@@ -163,9 +163,9 @@ def test_what_the_intensities_do_not_tell_of_m_is_no_error_of_the_instrument(pro
     def of_all(remainder=None):
         return sum(products.sum(axis=0) for _, products in mueller_slopes(problem, space, values, remainder))
 
-    full, half, nothing = (of_all(np.full(3, x)) for x in (1.0, 1e3, 1e9))
+    full, half, none = (of_all(np.full(3, x)) for x in (1.0, 1e3, 1e9))
     assert full == pytest.approx(of_all())
-    assert np.trace(nothing) < 1e-6 * np.trace(full)
+    assert np.trace(none) < 1e-6 * np.trace(full)
     assert 0.01 < np.trace(half) / np.trace(full) < 0.99
 
 

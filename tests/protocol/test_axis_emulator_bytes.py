@@ -13,8 +13,8 @@ def emulator(kind: str, **options: object) -> tuple[Emulator, ManualClock]:
     return served_kinds()[kind](ServeOptions(clock=clock, **options)), clock  # type: ignore[arg-type]
 
 
-def talk(device: Emulator, sent: bytes) -> bytes:
-    device.receive(sent)
+def talk(device: Emulator, request: bytes) -> bytes:
+    device.receive(request)
     return device.take_output()
 
 
@@ -279,13 +279,13 @@ def test_gcs2() -> None:
 
 def test_gsc_sets_a_move_and_drives_it() -> None:
     box, clock = emulator("gsc-01")
-    for sent, came in (
+    for request, reply in (
         (b"?:V\r\n", b"V1.10\r\n"),
         (b"H:1\r\n", b"OK\r\n"),
         (b"M:1+P400\r\n", b"NG\r\n"),
         (b"!:\r\n", b"B\r\n"),
     ):
-        assert talk(box, sent) == came
+        assert talk(box, request) == reply
     clock.sleep_s(60.0)
     assert talk(box, b"Q:\r\n") == b"         0,X,K,R\r\n"
     assert talk(box, b"G:\r\n") == b"NG\r\n"

@@ -54,8 +54,8 @@ def test_codes_are_those_that_aravis_has() -> None:
     aravis, _ = load_aravis()
     names = [name for name in dir(aravis) if name.startswith("PIXEL_FORMAT_")]
     codes = {name.replace("_", ""): int(getattr(aravis, name)) & 0xFFFFFFFF for name in names}
-    theirs = {fmt.name: codes.get(f"PIXELFORMAT{fmt.name.upper()}") for fmt in PIXEL_FORMATS}
-    named_codes = {name: code for name, code in theirs.items() if code is not None}
+    aravis_codes = {fmt.name: codes.get(f"PIXELFORMAT{fmt.name.upper()}") for fmt in PIXEL_FORMATS}
+    named_codes = {name: code for name, code in aravis_codes.items() if code is not None}
     assert {"Mono14", "BayerGR8", "BayerGB12p", "BayerBG10", "BayerBG16"} <= named_codes.keys()
     assert named_codes == {fmt.name: fmt.code for fmt in PIXEL_FORMATS if fmt.name in named_codes}
 

@@ -15,7 +15,7 @@ from simulators.serial.tcp_port import port_for
 def test_xps_bytes() -> None:
     emulator = xps_emulator.make(ServeOptions(clock=FastClock(instant=True)))
     talk, motion = emulator.connect(), emulator.connect()
-    for line, sent, came in (
+    for line, request, reply in (
         (talk, b"FirmwareVersionGet(char *)", b"0,XPS-C8 Firmware V2.6.x,EndOfAPI"),
         (talk, b"Login(Administrator,Administrator)", b"0,,EndOfAPI"),
         (talk, b"ObjectsListGet(char *)", b"0,Group1;Group2;;Group1.Pos;Group2.Pos,EndOfAPI"),
@@ -34,8 +34,8 @@ def test_xps_bytes() -> None:
         (motion, b"GroupMoveAbsolute(Group1.Pos,999)", b"-17,GroupMoveAbsolute(Group1.Pos,999),EndOfAPI"),
         (talk, b"GroupStatusGet(Group7,int *)", b"-19,GroupStatusGet(Group7,int *),EndOfAPI"),
     ):
-        line.receive(sent)
-        assert line.take_output() == came
+        line.receive(request)
+        assert line.take_output() == reply
     buffer = bytearray(b"0,12,EndOfAPI0,1.5,EndO")
     assert (xps.framer(buffer), xps.framer(buffer), bytes(buffer)) == (b"0,12", None, b"0,1.5,EndO")
 
@@ -57,8 +57,8 @@ def test_jog_and_gathering() -> None:
     clock = ManualClock()
     talk = xps_emulator.make(ServeOptions(clock=clock, homed=True, acceleration_deg_s2=100.0)).connect()
 
-    def answer(sent: bytes) -> bytes:
-        talk.receive(sent)
+    def answer(request: bytes) -> bytes:
+        talk.receive(request)
         return talk.take_output().removesuffix(b",EndOfAPI")
 
     assert answer(b"GroupJogParametersSet(Group1,5,100)").startswith(b"-22,")

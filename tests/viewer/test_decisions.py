@@ -76,8 +76,8 @@ def test_an_accepted_model_is_a_new_file_with_its_note(lab, client, diagnosed):
 @pytest.mark.parametrize("later", [{"accept": "yes", "file": "other.yaml"}, {}])
 def test_what_one_tab_has_decided_no_other_changes(lab, client, diagnosed, later):
     client.post("/decide", json={"name": diagnosed, "accept": "yes", "file": "new.yaml"}, headers=ORIGIN)
-    again = client.post("/decide", json={"name": diagnosed} | later, headers=ORIGIN)
-    assert (again.status_code, "decided already" in again.text) == (422, True)
+    answer = client.post("/decide", json={"name": diagnosed} | later, headers=ORIGIN)
+    assert (answer.status_code, "decided already" in answer.text) == (422, True)
     assert not (lab / "other.yaml").exists()
     assert "as <code>new.yaml" in client.get("/diagnosis", params={"name": diagnosed}).text
 

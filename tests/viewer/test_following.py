@@ -59,8 +59,13 @@ def test_a_run_says_where_it_is_while_it_runs_and_nothing_afterwards(lab):
 def test_a_process_that_has_ended_or_another_with_its_number_runs_nothing(lab):
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
-    mine = {"pid": os.getpid(), "begun_ticks": start_ticks(os.getpid()) - 1}
-    for name, facts in (("1", {"pid": ended.pid, "begun_ticks": 5}), ("2", mine), ("3", {"pid": "x"}), ("4", [])):
+    own_process = {"pid": os.getpid(), "begun_ticks": start_ticks(os.getpid()) - 1}
+    for name, facts in (
+        ("1", {"pid": ended.pid, "begun_ticks": 5}),
+        ("2", own_process),
+        ("3", {"pid": "x"}),
+        ("4", []),
+    ):
         (lab / f".run-{name}.json").write_text(json.dumps(facts))
     (lab / ".run-5.json").write_text("{half a")
     # Killed while it wrote, before its first version and after it.

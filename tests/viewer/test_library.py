@@ -55,15 +55,15 @@ def test_a_second_start_reads_no_file_again(lab, drr_capture, monkeypatch):
     read = []
     original = viewer.library._read
     monkeypatch.setattr(viewer.library, "_read", lambda *args: read.append(args[0].name) or original(*args))
-    again = viewer.library.Library(lab)
-    after = [vars(e) for e in again.entries()]
+    library = viewer.library.Library(lab)
+    after = [vars(e) for e in library.entries()]
     assert read == []
     for first, second in zip(before, after, strict=True):
         assert {k: v for k, v in first.items() if k != "header"} == {k: v for k, v in second.items() if k != "header"}
         assert first["header"].sample == second["header"].sample
     # A file that changed is read again, a damaged index is none.
     os.utime(lab / "one.h5", (1, 1))
-    again.entries()
+    library.entries()
     assert read
     (lab / ".umov-view/index.json").write_text("{")
     assert len(viewer.library.Library(lab).entries()) == MOST + 1

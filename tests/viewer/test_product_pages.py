@@ -111,9 +111,9 @@ def test_two_products_of_the_same_scene_differ_by_their_errors(client, lab, drr_
     Reduction(drr_capture("two.h5", seed_of_noise=2, mueller=np.diag([1.0, 0.6, 0.4, 0.3]))).make()
     query = {"a": "one.mueller.h5", "b": "two.mueller.h5", "name": "mueller"}
     assert client.get("/compare", params=query).status_code == 200
-    _, same = plane(client.get("/difference", params={**query, "index": 10}))
+    _, equal = plane(client.get("/difference", params={**query, "index": 10}))
     (_, _, apart, _), difference = plane(client.get("/difference", params={**query, "index": 5}))
-    assert same["rms_over"] == pytest.approx(1, abs=0.2)
+    assert equal["rms_over"] == pytest.approx(1, abs=0.2)
     assert np.median(apart) == pytest.approx(-0.1, abs=0.01)
     assert difference["rms_over"] > 2
 
