@@ -18,8 +18,6 @@ import matplotlib.figure  # noqa: F401
 import numpy as np
 import pytest
 
-from tests.commands import exit_code
-
 ROOT = Path(__file__).resolve().parents[1]
 
 CLONE_NEWNET = 0x40000000
@@ -175,6 +173,7 @@ def dim_instrument(configs: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def run_main(capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
     """Runs an entry point in this process; returns exit code, standard output and standard error."""
+    from tests.commands import exit_code
 
     def run(main: Callable[[list[str]], None], *arguments: object, traceback: bool = False) -> tuple[int, str, str]:
         capfd.readouterr()
