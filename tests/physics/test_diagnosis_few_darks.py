@@ -92,6 +92,32 @@ def test_noise_of_darks_is_no_fault_where_states_are_dark(camera, darks, texture
         assert diagnosis.noise.verdict == "as_declared"
 
 
+def test_darks_of_a_mosaic_take_no_slope_of_the_light(synthetic_capture, configs):
+    """Channels that look at places apart differ in all states alike, as dark frames do. It was a sure field."""
+    file = configs / "instruments/mosaic_polarimeter.yaml"
+    model, gain, read, darks = InstrumentModel.load(file), 25.0, 50.0, 6
+    angles = {"psg": 22.5 * np.arange(16)}
+    rows = model.at(662).rows(angles) @ np.eye(4).ravel()
+    random = np.random.default_rng(79)
+    x, y = np.linspace(-1, 1, 58), np.linspace(-1, 1, 58)[:, None]
+    light = np.zeros((darks + 16, 1, 58, 58))
+    for k, channel in enumerate(model.channels):
+        (r, c), *_ = np.argwhere(np.array(model.mosaic) == channel.name)
+        light[darks:, 0, r::2, c::2] = rows[:, k, None, None] * (8000 * (1 - 0.4 * (x**2 + y**2)))[r::2, c::2]
+    frames = random.poisson(light) + random.normal(0, read, light.shape)
+    path = synthetic_capture(
+        np.round(frames / gain + 20).astype(np.uint16),
+        {"psg": np.r_[np.zeros(darks), angles["psg"]]},
+        role=("dark",) * darks + ("sample",) * 16,
+        sample={"kind": "air"},
+        mosaic=model.mosaic,
+        instrument_yaml=file.read_text(),
+        detector={"gain_e_per_count": gain, "read_noise_e": read, "bits": 10},
+    )
+    found = diagnose_captures([path], model)[0].diagnosis
+    assert (found.verdict, found.effects) == ("consistent", ())
+
+
 def test_a_bend_is_named_where_read_noise_is_a_quarter_of_a_count(synthetic_capture):
     """What rounding may do to whole frames is no reason to look no longer at the noise of the light behind a bend."""
     turned, bend, gain = 4.5 * np.arange(40), 0.03, 1.3

@@ -66,7 +66,12 @@ def without_noise_of_darks(
     residual, fit = u.astype(np.float32).T @ z / spread, inside.astype(np.float32).T @ z
     # Fit and residual share the dark error. Only a fit without it says what of the residual follows the light.
     centred = residual - residual.mean(axis=1, keepdims=True)
-    of_dark = _project_out(residual, fit - inside.T @ in_light @ (size / spread * centred))
+    light = fit - inside.T @ in_light @ (size / spread * centred)
+    if data.place_px is not None:
+        # Channels that look at places apart differ by the slopes of the light, in all states alike.
+        images = np.tensordot((inside.T / sd).astype(np.float32), y[counts], 1)
+        light = np.concatenate([light, *(slope[:, good] for slope in np.gradient(images, axis=(1, 2)))])
+    of_dark = _project_out(residual, light)
     # A pixel with a hit, or a hot one, tells nothing of its dark frames.
     of_dark[np.abs(of_dark) > OUTSTANDING] = 0.0
     subtracted = np.zeros((len(y), of_dark.shape[1]), dtype=np.float32)
