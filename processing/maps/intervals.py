@@ -188,7 +188,9 @@ def set_ratios(planes: Planes, derived: Mapping[str, Derived], image: ElementNoi
             # No ratio to m00.
             bent, shared = np.zeros_like(u), np.zeros_like(shared)
         low, high = whole_range(name, middle)
-        half = np.max(np.abs(over_m00(np.stack([-error[..., some], error[..., some]]), bent, shared, 1.0)), axis=0)
+        # Uneven by Fieller: with its larger side 68 % intervals covered up to 85 %.
+        ends = over_m00(np.stack([-error[..., some], error[..., some]]), bent, shared, 1.0)
+        half = (ends[1] - ends[0]) / 2
         everything = np.where(np.isfinite(middle), np.maximum(middle - low, high - middle), high - low)
         error[..., some] = np.where(u < 1 / LEAST_M00, half, everything)
         if has_own_95(name):
@@ -224,11 +226,14 @@ def whole_range(name: str, value: Array) -> tuple[Array, Array]:
     return np.broadcast_to(low[grow], value.shape), np.broadcast_to(high[grow], value.shape)
 
 
-def moves_of(systematic: Systematic, image: MuellerImage) -> Array:
-    """Change of M by one standard uncertainty of each uncertain input of the instrument: (D, 16, rows, columns)."""
+def moves_of(systematic: Systematic, image: MuellerImage, *, is_held: bool = True) -> Array:
+    """Change of M by one standard uncertainty of each uncertain input of the instrument: (D, 16, rows, columns).
+
+    `is_held` as in `Systematic.moves`.
+    """
     # What a partial polarimeter does not determine is zero in the solution of least norm.
     values = np.where(image.is_determined[:, None], image.values.reshape(16, -1), 0)
-    return np.stack(list(systematic.moves(values))).reshape(-1, 16, *image.mask.shape)
+    return np.stack(list(systematic.moves(values, is_held=is_held))).reshape(-1, 16, *image.mask.shape)
 
 
 def set_systematic(planes: Planes, derived: Mapping[str, Derived], moves: Array) -> Planes:

@@ -195,7 +195,7 @@ class _Mean:
                 shared = product.array(s0) if product.has_array(s0) else neighbour_correlation(product)
                 stokes = _stokes_mean(StokesImage.load(source, rows), columns, shared, source)
                 values = stokes.values.reshape(3, 1)
-                moved = () if systematic is None else list(systematic.moves(values))
+                moved = () if systematic is None else list(systematic.moves(values, is_held=False))
                 return cls(stokes, np.reshape(moved, (len(inputs), 3, 1, 1)), inputs)
             full = MuellerImage.of(product, rows)
             errors = product.get("stokes_errors", rows) if full.sent is not None else None
@@ -204,7 +204,7 @@ class _Mean:
             return cls(image, np.zeros((0, 16, 1, 1)), inputs)
         # What was fitted is the light where no element is determined alone.
         fitted = image if full.sent is None else replace(full, sent=image.values[:, 0], mask=image.mask)
-        return cls(image, moves_of_light(systematic, fitted), inputs)
+        return cls(image, moves_of_light(systematic, fitted, is_held=False), inputs)
 
     def numbers(self) -> dict[str, _Number]:
         # Without light a ratio is NaN.
@@ -296,8 +296,8 @@ def _combine(means: Sequence[_Mean]) -> _Mean:
 
 def _stokes_numbers(image: StokesImage, moves: Array) -> dict[str, _Number]:
     s, c = image.values.reshape(3).astype(float), image.covariance.reshape(3, 3)
-    none = np.zeros(len(moves))
-    numbers = {"s0": _Number(s[0], float(np.sqrt(c[0, 0])), none, "count")}
+    numbers = {"s0": _Number(s[0], float(np.sqrt(c[0, 0])), moves[:, 0], "count")}
+    moves = moves - moves[:, :1] * s / s[0]
     for k in (1, 2):
         ratio = s[k] / s[0]
         error = np.sqrt(c[k, k] - 2 * ratio * c[0, k] + ratio**2 * c[0, 0]) / s[0]
@@ -316,13 +316,12 @@ def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
     light = is_first_column(image.is_determined)
     for k in np.flatnonzero(image.is_determined).tolist():
         gradient = np.zeros(16)
-        # A common gain is not measured: the error of m00 is noise alone.
         value = m[0] if k == 0 else m[k] / m[0]
         gradient[0] = 1.0 if k == 0 else -value / m[0]
         if k:
             gradient[k] = 1 / m[0]
         error = float(np.sqrt(image.variance_of(gradient.reshape(1, 1, 16)).item()))
-        moved = np.asarray(moves[..., 0, 0] @ gradient) if k else np.zeros(len(moves))
+        moved = np.asarray(moves[..., 0, 0] @ gradient)
         if light:
             name, unit = ("s0", "count") if k == 0 else (f"s{k // 4}_over_s0", "")
         else:

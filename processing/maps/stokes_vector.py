@@ -77,12 +77,15 @@ def light_of(image: MuellerImage, stokes_errors: NDArray[np.float32] | None) -> 
     )
 
 
-def moves_of_light(systematic: Systematic, image: MuellerImage) -> NDArray[np.float64]:
-    """Change of the first column of M by each uncertain input of the instrument: (D, 16, rows, columns)."""
+def moves_of_light(systematic: Systematic, image: MuellerImage, *, is_held: bool = True) -> NDArray[np.float64]:
+    """Change of the first column of M by each uncertain input of the instrument: (D, 16, rows, columns).
+
+    `is_held` as in `Systematic.moves`.
+    """
     if image.sent is None:
-        return moves_of(systematic, image)
+        return moves_of(systematic, image, is_held=is_held)
     least = np.linalg.pinv(image.w, rcond=SMALLEST) @ image.fitted
-    moved = np.stack(list(systematic.moves(least, sent_rows(image.w))))
+    moved = np.stack(list(systematic.moves(least, sent_rows(image.w), is_held=is_held)))
     moves = np.zeros((len(moved), 16, *image.mask.shape))
     moves[:, ::4] = moved.reshape(len(moved), 4, *image.mask.shape)
     return moves

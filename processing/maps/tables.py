@@ -81,7 +81,7 @@ def _add_mueller(
         if table.has_noise:
             yield np.square(scale) * _turn_variance(pixels, turns)
         if table.inputs and (systematic := Systematic.of_product(product)) is not None:
-            for moved in systematic.moves(pixels.values.reshape(16, -1)):
+            for moved in systematic.moves(pixels.values.reshape(16, -1), is_held=False):
                 yield scale * _turn(moved, turns)
         if white is not None:
             yield white.u * groups.mean(values)

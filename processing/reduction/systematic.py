@@ -146,10 +146,15 @@ class Systematic:
         """What is uncertain, one name for each direction."""
         return tuple(d.label for d in self.directions)
 
-    def moves(self, values: NDArray[np.floating], rows: Array | None = None) -> Iterator[Array]:
-        """What each direction does to `rows` (J, K) times the unknowns (K, pixels), their first held: (J, pixels).
+    def moves(
+        self, values: NDArray[np.floating], rows: Array | None = None, *, is_held: bool = True
+    ) -> Iterator[Array]:
+        """What each direction does to `rows` (J, K) times the unknowns (K, pixels): (J, pixels).
 
-        Only ratios to the first (m00, S0) are measured; `rows` are by default the unknowns themselves.
+        Parameters
+        ----------
+        rows : by default the unknowns themselves.
+        is_held : move ratios to the first (m00, S0) alone; else counts, the first included.
         """
         m = values.astype(np.float64)
         rows = np.eye(len(m)) if rows is None else rows
@@ -161,7 +166,7 @@ class Systematic:
             if direction.counts is not None:
                 moved += self.inverse @ self.bent(direction, self.w @ m)
             moved = rows @ moved
-            yield moved - relative * moved[0]
+            yield moved - relative * moved[0] if is_held else moved
 
     def bent(self, direction: Direction, intensities: NDArray[np.floating]) -> Array:
         """What a direction adds to intensities (L, pixels) in counts."""
