@@ -40,22 +40,24 @@ class Sorted(NamedTuple):
     ----------
     middle, half : of the 68 % interval; the three middles add up to zero.
     below, above : from there to the ends of the 95 % interval.
+    own : errors to first order, over those with noise that is alike in all directions; all widths are in proportion.
     """
 
     middle: Array
     half: Array
     below: Array
     above: Array
+    own: Array | float = 1.0
 
     def with_mean(self, u: Array) -> "Sorted":
         """Intervals where the mean of the three has this standard uncertainty (...) instead."""
 
         def wide(size: Array, deviate: float) -> Array:
-            own = np.maximum(size**2 - deviate**2 * OF_MEAN, _LEAST * size**2)
-            return np.asarray(np.sqrt(own + np.square(deviate * u)))
+            alone = np.maximum(size**2 - np.square(deviate * self.own) * OF_MEAN, _LEAST * size**2)
+            return np.asarray(np.sqrt(alone + np.square(deviate * u)))
 
-        ends = (wide(size, NORMAL_95) for size in (self.below, self.above))
-        return Sorted(self.middle, wide(self.half, 1.0), *ends)
+        below, above = (wide(size, NORMAL_95) for size in (self.below, self.above))
+        return Sorted(self.middle, wide(self.half, 1.0), below, above, self.own)
 
 
 def block_components(covariance: NDArray[np.float64]) -> float:
@@ -100,7 +102,7 @@ def of_gaps(first: Array, second: Array, own: Array, components: float) -> Sorte
     # What the three add up to is known.
     middle = (low + high) / 2
     middle -= middle.mean(axis=0)
-    return Sorted(middle, (high - low) / 2, middle - low_95, high_95 - middle)
+    return Sorted(middle, (high - low) / 2, middle - low_95, high_95 - middle, own)
 
 
 def _shifts(first: Array, second: Array, components: float) -> NDArray[np.float64]:

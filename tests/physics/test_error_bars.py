@@ -282,6 +282,13 @@ def test_poor_states_have_intervals_that_cover_too(instrument: str) -> None:
     assert len(low) <= 3, low
 
 
+def test_a_deviation_has_no_noise_of_the_mean_whatever_its_own() -> None:
+    """The same was taken off a small error as off a large one: 95 % intervals covered 89 %."""
+    found = cells("127 degrees, 9 to 1, 41", 1, 200, 1000, samples=["det < 0"], extra=(), first_seed=11)
+    cell = next(c for c in found if c.quantity == "eigenvalue_deviation")
+    assert 0.915 < cell.in_95 < 0.97
+
+
 def test_a_ratio_to_a_noisy_m00_has_no_wider_error_than_its_noise() -> None:
     """It was the larger side of an uneven interval: 68 % intervals covered 74 % on average, 80 % at most."""
     samples = ["air", "mirror", "DoLP 0.2", "triply degenerate", "retarder 2", "polarizer 1:100"]
