@@ -67,7 +67,7 @@ def without_noise_of_darks(
     # Fit and residual share the dark error. Only a fit without it says what of the residual follows the light.
     centred = residual - residual.mean(axis=1, keepdims=True)
     light = fit - inside.T @ in_light @ (size / spread * centred)
-    if data.place_px is not None:
+    if data.place_px is not None and min(data.usable.shape) > 1:
         # Channels that look at places apart differ by the slopes of the light, in all states alike.
         images = np.tensordot((inside.T / sd).astype(np.float32), y[counts], 1)
         light = np.concatenate([light, *(slope[:, good] for slope in np.gradient(images, axis=(1, 2)))])
