@@ -56,7 +56,7 @@ class ReflectanceProblem:
         return False
 
     def noise_information(self, space, values):
-        return np.zeros((space.size, space.size))
+        return np.zeros((space.size, space.size)), np.zeros((space.size, space.size))
 
     def time_noise(self, space, values):
         return np.zeros(space.size)

@@ -9,6 +9,7 @@ from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block, noise_information
 from processing.diagnosis.instrument.structure import Images, Residual, _tests, descriptions
+from processing.diagnosis.search.linearization import _with_noise_of_slopes
 from processing.diagnosis.search.space import Sums
 from processing.instrument.model import InstrumentModel
 
@@ -24,7 +25,7 @@ def noisy():
 
 
 @pytest.mark.parametrize("moved", [False, True])
-def test_a_shift_of_noise_promises_nothing(noisy, moved):
+def test_a_shift_or_a_bend_of_noise_promises_nothing(noisy, moved):
     random = np.random.default_rng(5)
     data = noisy.moved_back(random.uniform(-0.6, 0.6, (STATES, 2))) if moved else noisy
     moments = moments_of(data, 1)
@@ -33,17 +34,19 @@ def test_a_shift_of_noise_promises_nothing(noisy, moved):
     c = np.zeros((len(FEATURES), STATES))
     c[0] = 1.0
     c[-DERIVATIVES:] = random.normal(size=(DERIVATIVES, STATES))
-    dc = np.zeros((2, len(FEATURES), STATES))
+    dc = np.zeros((3, len(FEATURES), STATES))
+    # A bend of the response: counts of one brightness are stretched alike, and noise with them.
+    dc[2, FEATURES.index("log")] = 1.0
     dc[0, FEATURES.index("dx")] = random.normal(size=STATES)
     dc[1, FEATURES.index("dyy")] = random.normal(size=STATES)
-    sums, (block,) = Sums.empty(1, 2), moments.blocks
-    add_block(block, a, c, np.zeros((2, *a.shape)), dc=dc, moments=moments, out=sums)
+    sums, (block,) = Sums.empty(1, 3), moments.blocks
+    add_block(block, a, c, np.zeros((3, *a.shape)), dc=dc, moments=moments, out=sums)
     # Derivatives share noise with neighbours: the excess varies up to twice as much as with independent values.
     assert abs(sums.excess[0]) < 5 * np.sqrt(2 * 2 * sums.freedom[0])
     error = np.sqrt(np.diag(sums.curvature[0]))
     assert np.all(np.abs(sums.gradient[0]) < 5 * error)
     # All of the curvature is noise.
-    part = noise_information(block, a, dc, moments)
+    part, _ = noise_information(block, a, dc, moments)
     assert part == pytest.approx(sums.curvature[0], rel=0.03, abs=0.03 * np.max(part))
 
 
@@ -97,3 +100,13 @@ def test_what_captures_leave_over_is_told_with_their_names():
         "c.h5: sum of squares: 12 standard deviations above noise",
         "c.h5: states that are furthest off on average: 1, 2, 0",
     )
+
+
+def test_a_gradient_that_varies_more_leaves_the_minimum_and_widens_its_error():
+    random = np.random.default_rng(8)
+    root, noisy = random.normal(size=(5, 9)), random.normal(size=(5, 2)) * np.array([0, 1, 0, 1, 0])[:, None]
+    curvature, variance, gradient = root @ root.T, noisy @ noisy.T, random.normal(size=5)
+    g, h = _with_noise_of_slopes(gradient, curvature, variance)
+    inverse = np.linalg.inv(curvature)
+    assert np.linalg.solve(h, g) == pytest.approx(inverse @ gradient)
+    assert np.linalg.inv(h) == pytest.approx(inverse @ (curvature + variance) @ inverse)

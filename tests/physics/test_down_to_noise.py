@@ -50,8 +50,8 @@ class Bench:
     def relinearize(self, space: Space, values: np.ndarray) -> bool:
         return False
 
-    def noise_information(self, space: Space, values: np.ndarray) -> np.ndarray:
-        return np.zeros((values.size, values.size))
+    def noise_information(self, space: Space, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros((values.size, values.size)), np.zeros((values.size, values.size))
 
     def time_noise(self, space: Space, values: np.ndarray) -> np.ndarray:
         return np.zeros(values.size)
@@ -131,8 +131,8 @@ class Valley:
     def relinearize(self, space: Space, values: np.ndarray) -> bool:
         return False
 
-    def noise_information(self, space: Space, values: np.ndarray) -> np.ndarray:
-        return np.zeros((2, 2))
+    def noise_information(self, space: Space, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros((2, 2)), np.zeros((2, 2))
 
     def time_noise(self, space: Space, values: np.ndarray) -> np.ndarray:
         return np.zeros(values.size)

@@ -57,10 +57,11 @@ def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic
     a = sums.stretch.sum(axis=0) * typical / freedom
     g = sums.gradient.sum(axis=0) * typical
     h = sums.curvature.sum(axis=0) * np.outer(typical, typical)
-    h = h - np.outer(g, a) - np.outer(a, g) + (excess - freedom) * np.outer(a, a)
-    g = g - excess * a
-    factors = _signal_share(problem, space, x, h, typical=typical)
-    h, g = h * np.outer(factors, factors), g * factors
+    information, variance = (part * np.outer(typical, typical) for part in problem.noise_information(space, x))
+    # The noise of a bend that is alike in all counts goes off with the stretch.
+    alike = freedom * np.outer(a, a)
+    h = h - information - np.outer(g, a) - np.outer(a, g) + excess * np.outer(a, a)
+    g, h = _with_noise_of_slopes(g - excess * a, _without_negative(h), variance - 2 * alike)
     excess, g, h = _integrate_out(np.sqrt(problem.time_noise(space, x)) / typical, excess, g, h)
     h = _without_negative(h)
     z = x / typical
@@ -87,7 +88,21 @@ def _integrate_out(sigma: Array, excess: float, g: Array, h: Array) -> tuple[flo
     return float(excess - g[index] @ cov @ g[index]), g - across @ cov @ g[index], h - across @ cov @ across.T
 
 
-def _signal_share(problem: Problem, space: Space, x: Array, h: Array, *, typical: Array) -> Array:
-    """Share (K,) of the curvature that is not noise of image derivatives."""
-    noise = np.diag(problem.noise_information(space, x)) * typical**2
-    return np.asarray(np.clip(1 - noise / np.maximum(np.diag(h), 1e-300), 0.0, 1.0))
+def _with_noise_of_slopes(g: Array, h: Array, variance: Array) -> tuple[Array, Array]:
+    """Gradient and curvature of the same minimum, less certain by a further `variance` (K, K) of the gradient.
+
+    The values H^-1 g have the covariance H^-1 (H + V) H^-1, the inverse of H (H + V)^-1 H.
+    """
+    index = np.flatnonzero(np.diag(variance) > 0)
+    if not index.size:
+        return g, h
+    own = _without_negative(variance[np.ix_(index, index)])
+    total = h.copy()
+    total[np.ix_(index, index)] += own
+    total += np.finfo(float).eps * len(h) * float(np.trace(total)) * np.eye(len(h))
+    columns = np.column_stack([np.eye(len(h))[:, index], g])
+    solved = np.linalg.solve(total, columns)[index]
+    g, h = g.copy(), h.copy()
+    g[index] -= own @ solved[:, -1]
+    h[np.ix_(index, index)] += own @ solved[:, :-1] @ own - own
+    return g, (h + h.T) / 2

@@ -157,7 +157,11 @@ def _expand(
         # Several large causes, none of which explains much alone, or far from linear: from all of them at once as well.
         begun.append(look(all_at_once(problem, space, fixed, start, noise=first.sets.noise, tau=TAU[-1])))
         bent = [g for g, indices in enumerate(members) if space.candidates[indices[0]].effect.has_bent_valley]
-        by_itself = [look(alone(problem, space, members[g]), np.arange(len(groups)) == g) for g in bent]
+        # A cause far from linear is first explained by many others, from which no straight line leads back to it.
+        strongest = int(np.argmax(np.where(first.sets.free, first.sets.conditional(first.sets.empty()).log_odds, -np.inf)))
+        by_itself = [
+            look(alone(problem, space, members[g]), np.arange(len(groups)) == g) for g in sorted({*bent, strongest})
+        ]
         begun += [trial for trial in by_itself if trial is not None and trial.score > first.score]
     rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
     ended = [_settle(problem, space, trial, look, rounds=rounds) for trial in begun if trial is not None]

@@ -187,8 +187,8 @@ class Problem(Protocol):
         """Take these values as the point that corrections are expanded about; False if one as close is known."""
         ...
 
-    def noise_information(self, space: Space, values: Array) -> Array:
-        """Part (K, K) of the curvature that is noise of image derivatives and has no information about the values."""
+    def noise_information(self, space: Space, values: Array) -> tuple[Array, Array]:
+        """Part (K, K) of the curvature that is noise and tells nothing, and what it adds to the gradient's variance."""
         ...
 
     def time_noise(self, space: Space, values: Array) -> Array:

@@ -266,8 +266,8 @@ class SurfaceProblem:
         """None of these effects has a value for each state."""
         return np.zeros(space.size)
 
-    def noise_information(self, space: Space, values: Array) -> Array:
-        """Part (K, K) of the curvature that comes from the noise of alpha_0 and tells nothing about the values."""
+    def noise_information(self, space: Space, values: Array) -> tuple[Array, Array]:
+        """Part (K, K) of the curvature that noise of alpha_0 makes, which is what it adds to the gradient's variance."""
         information = np.zeros((space.size, space.size))
         for k in range(len(self.captures)):
             pixels = self.pixels(k, space, values)
@@ -276,7 +276,7 @@ class SurfaceProblem:
             d = [pixels.outside(columns - pixels.columns) * free[:, None] / step for step, columns, _, _ in moved]
             flat = np.reshape(d, (space.size, pixels.residual.size))
             information += flat @ flat.T
-        return information
+        return information, information
 
 
 def _held(full: Array, tile: NDArray[np.int64]) -> tuple[Array, Array]:

@@ -259,7 +259,7 @@ def unobservable(problem: DiagnosisProblem, posterior: Posterior) -> list[Candid
         if candidate.reaches_around:
             # Noise alone has slopes too, from one pixel to the next, which a shift would change.
             alone = Space((candidate,))
-            noise = np.diag(problem.noise_information(alone, np.zeros(alone.size))) * candidate.typical**2
+            noise = np.diag(problem.noise_information(alone, np.zeros(alone.size))[0]) * candidate.typical**2
             least = np.maximum(least, SMALL * noise)
         if np.all(precision[part] < least):
             unseen.append(candidate)
