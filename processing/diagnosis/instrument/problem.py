@@ -18,7 +18,7 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData
-from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
+from processing.diagnosis.instrument.features import FEATURES
 from processing.diagnosis.instrument.moments import Moments, folds_of, moments_of
 from processing.diagnosis.instrument.photon_noise import distance, exactly_undone, movable, undoing, with_noise_of_light
 from processing.diagnosis.instrument.projection import add_block, noise_information
@@ -344,7 +344,7 @@ class InstrumentProblem:
         return total
 
     def noise_information(self, space: Space, values: Array) -> tuple[Array, Array]:
-        """Part (K, K) of the curvature that noise of the features makes, and what it adds to the gradient's variance."""
+        """Part (K, K) of the curvature that noise of the features makes, and what it adds to the gradient's scatter."""
         nearest, local = self.near(space, values)
         if nearest is not self:
             return nearest.noise_information(space, local)

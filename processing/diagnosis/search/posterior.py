@@ -32,6 +32,7 @@ from processing.diagnosis.search.rules import (
     CHANGES,
     FEWER_ROUNDS,
     GROWTH,
+    NEEDED,
     ROUNDS,
     SAMPLES,
     SURE,
@@ -153,16 +154,18 @@ def _expand(
     first = look(start)
     assert first is not None, "the instrument as declared has no intensities"
     begun: list[_Round | None] = [first]
-    if first.state.unit > BENT or not problem.noise_known:
+    # A large cause is far from linear: first many others explain it, from which no straight line leads back to it.
+    odds = np.where(first.sets.free, first.sets.conditional(first.sets.empty(), follow=True).log_odds, -np.inf)
+    is_far = first.state.unit > BENT or not problem.noise_known
+    by_themselves = {int(np.argmax(odds))} if is_far or odds.max() > NEEDED else set()
+    if is_far:
         # Several large causes, none of which explains much alone, or far from linear: from all of them at once as well.
         begun.append(look(all_at_once(problem, space, fixed, start, noise=first.sets.noise, tau=TAU[-1])))
-        bent = [g for g, indices in enumerate(members) if space.candidates[indices[0]].effect.has_bent_valley]
-        # A cause far from linear is first explained by many others, from which no straight line leads back to it.
-        strongest = int(np.argmax(np.where(first.sets.free, first.sets.conditional(first.sets.empty()).log_odds, -np.inf)))
-        by_itself = [
-            look(alone(problem, space, members[g]), np.arange(len(groups)) == g) for g in sorted({*bent, strongest})
-        ]
-        begun += [trial for trial in by_itself if trial is not None and trial.score > first.score]
+        bent = (g for g, indices in enumerate(members) if space.candidates[indices[0]].effect.has_bent_valley)
+        by_themselves.update(bent)
+    for g in sorted(by_themselves):
+        trial = look(alone(problem, space, members[g]), np.arange(len(groups)) == g)
+        begun += [trial] if trial is not None and trial.score > first.score else []
     rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
     ended = [_settle(problem, space, trial, look, rounds=rounds) for trial in begun if trial is not None]
     last = max(ended, key=lambda trial: trial.score)

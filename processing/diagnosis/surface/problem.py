@@ -267,7 +267,7 @@ class SurfaceProblem:
         return np.zeros(space.size)
 
     def noise_information(self, space: Space, values: Array) -> tuple[Array, Array]:
-        """Part (K, K) of the curvature that noise of alpha_0 makes, which is what it adds to the gradient's variance."""
+        """Part (K, K) of the curvature that noise of alpha_0 makes, and what it adds to the gradient's scatter."""
         information = np.zeros((space.size, space.size))
         for k in range(len(self.captures)):
             pixels = self.pixels(k, space, values)
