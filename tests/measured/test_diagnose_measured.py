@@ -110,7 +110,7 @@ def held_out_of_each(public_files, configs: Path, tmp_path: Path, wavelengths: t
     return [c for c in d.correction.checks if c.name.startswith("rms on held-out data of")]
 
 
-@pytest.mark.long
+@pytest.mark.skipif("UMOV_SLOW" not in os.environ, reason="ten wavelengths of one sample are quicker: UMOV_SLOW=1")
 def test_four_wavelengths_of_the_telescope_share_the_angles_of_their_states(public_files, configs, tmp_path):
     checks = held_out_of_each(public_files, configs, tmp_path, (1575, 1744, 1932, 2139))
     assert len(checks) == 4
