@@ -344,11 +344,11 @@ class InstrumentProblem:
         return total
 
     def noise_information(self, space: Space, values: Array) -> tuple[Array, Array]:
-        """Part (K, K) of the curvature that noise of the features makes, and what it adds to the gradient's scatter."""
+        """Parts (K, K) of the curvature that the noise of image derivatives makes, and that of the counts."""
         nearest, local = self.near(space, values)
         if nearest is not self:
             return nearest.noise_information(space, local)
-        information = np.zeros((2, space.size, space.size))
+        totals = np.zeros((2, space.size, space.size))
         for k, moments in enumerate(self.moments):
             acting = space.acting(k, self.wavelengths_nm[k])
             subspace, values_k = acting.space, acting.of(values)
@@ -357,9 +357,9 @@ class InstrumentProblem:
             dc = self.slopes_of_counts(k, subspace, values_k, self.coefficients(k, changes))
             if np.any(dc):
                 noise = np.sum([noise_information(block, a, dc, moments) for block in moments.blocks], axis=0)
-                for total, part in zip(information, noise, strict=True):
+                for total, part in zip(totals, noise, strict=True):
                     total[np.ix_(acting.index, acting.index)] += acting.spread_products(part)
-        return information[0], information[1]
+        return totals[0], totals[1]
 
     def time_noise(self, space: Space, values: Array) -> Array:
         """Variance (K,) that errors of the frames' times make of a source's level in each state, where it drifts."""

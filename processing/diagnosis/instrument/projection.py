@@ -249,27 +249,24 @@ def add_parts(
 
 
 def noise_information(block: Block, a: Array, dc: Array, moments: Moments) -> tuple[Array, Array]:
-    """Part (K, K) of the curvature that noise of the features makes, and what it adds to the variance of the gradient.
+    """Parts (K, K) of the curvature that the noise of image derivatives makes, and the noise of the counts themselves.
 
     Of rows a (L, K) in units of their noise and derivatives dc (K, F, L) of the coefficients by the values.
     """
-    rows = block.rows
+    rows, of_derivatives = block.rows, np.zeros((len(dc), len(dc)))
     q = range_of(a[rows])
     hat = q @ q.T
     noise = block.noise[rows] / moments.sigma[rows, None, None] ** 2
     plain, around = dc[:, :-DERIVATIVES][..., rows], dc[:, -DERIVATIVES:][..., rows]
-    outside = np.sqrt(1 - np.diagonal(hat))
-    carried = np.einsum("kfl,lfg->klg", plain * outside, noise[:, :-DERIVATIVES, :-DERIVATIVES])
-    of_counts = _flat(carried) @ _flat((plain * outside).swapaxes(1, 2)).T
-    information = of_counts.copy()
+    carried = np.einsum("kfl,lfg->klg", plain * (1 - np.diagonal(hat)), noise[:, :-DERIVATIVES, :-DERIVATIVES])
+    of_counts = _flat(carried) @ _flat(plain.swapaxes(1, 2)).T
     if (moving := np.flatnonzero(np.any(around, axis=(1, 2)))).size:
         # P diag(dc) Q Q^T for each value and derivative.
         into = around[moving, :, :, None] * hat
         into -= hat @ into
         noise = noise[:, -DERIVATIVES:, -DERIVATIVES:]
-        information[np.ix_(moving, moving)] += np.einsum("ielk,keh,jhlk->ij", into, noise, into, optimize=True)
-    # The noise of a count is that of its correction: its square varies twice as much as a product of two counts.
-    return information, information + of_counts
+        of_derivatives[np.ix_(moving, moving)] = np.einsum("ielk,keh,jhlk->ij", into, noise, into, optimize=True)
+    return of_derivatives, of_counts
 
 
 def _flat(x: Array) -> Array:

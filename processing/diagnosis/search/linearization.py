@@ -57,11 +57,14 @@ def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic
     a = sums.stretch.sum(axis=0) * typical / freedom
     g = sums.gradient.sum(axis=0) * typical
     h = sums.curvature.sum(axis=0) * np.outer(typical, typical)
-    information, variance = (part * np.outer(typical, typical) for part in problem.noise_information(space, x))
-    # The noise of a bend that is alike in all counts goes off with the stretch.
-    alike = freedom * np.outer(a, a)
-    h = h - information - np.outer(g, a) - np.outer(a, g) + excess * np.outer(a, a)
-    g, h = _with_noise_of_slopes(g - excess * a, _without_negative(h), variance - 2 * alike)
+    of_derivatives, of_counts = (part * np.outer(typical, typical) for part in problem.noise_information(space, x))
+    h = h - of_counts - np.outer(g, a) - np.outer(a, g) + excess * np.outer(a, a)
+    g = g - excess * a
+    # Share of each curvature that is not noise of image derivatives.
+    share = np.clip(1 - np.diag(of_derivatives) / np.maximum(np.diag(h), 1e-300), 0.0, 1.0)
+    # The square of a count's noise varies twice as much as a product of two; what all counts share goes off.
+    variance = 2 * (of_counts - freedom * np.outer(a, a))
+    g, h = _with_noise_of_counts(g * share, _without_negative(h * np.outer(share, share)), variance)
     excess, g, h = _integrate_out(np.sqrt(problem.time_noise(space, x)) / typical, excess, g, h)
     h = _without_negative(h)
     z = x / typical
@@ -88,7 +91,7 @@ def _integrate_out(sigma: Array, excess: float, g: Array, h: Array) -> tuple[flo
     return float(excess - g[index] @ cov @ g[index]), g - across @ cov @ g[index], h - across @ cov @ across.T
 
 
-def _with_noise_of_slopes(g: Array, h: Array, variance: Array) -> tuple[Array, Array]:
+def _with_noise_of_counts(g: Array, h: Array, variance: Array) -> tuple[Array, Array]:
     """Gradient and curvature of the same minimum, less certain by a further `variance` (K, K) of the gradient.
 
     The values H^-1 g have the covariance H^-1 (H + V) H^-1, the inverse of H (H + V)^-1 H.

@@ -188,7 +188,7 @@ class Problem(Protocol):
         ...
 
     def noise_information(self, space: Space, values: Array) -> tuple[Array, Array]:
-        """Part (K, K) of the curvature that is noise and tells nothing, and what it adds to the gradient's variance."""
+        """Parts (K, K) of the curvature that the noise of image derivatives makes, and that of the data themselves."""
         ...
 
     def time_noise(self, space: Space, values: Array) -> Array:

@@ -267,7 +267,7 @@ class SurfaceProblem:
         return np.zeros(space.size)
 
     def noise_information(self, space: Space, values: Array) -> tuple[Array, Array]:
-        """Part (K, K) of the curvature that noise of alpha_0 makes, and what it adds to the gradient's scatter."""
+        """Part (K, K) of the curvature that noise of alpha_0 makes, which no value stretches as a response does."""
         information = np.zeros((space.size, space.size))
         for k in range(len(self.captures)):
             pixels = self.pixels(k, space, values)
@@ -276,7 +276,7 @@ class SurfaceProblem:
             d = [pixels.outside(columns - pixels.columns) * free[:, None] / step for step, columns, _, _ in moved]
             flat = np.reshape(d, (space.size, pixels.residual.size))
             information += flat @ flat.T
-        return information, information
+        return information, np.zeros_like(information)
 
 
 def _held(full: Array, tile: NDArray[np.int64]) -> tuple[Array, Array]:
