@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from steady_capture import steady_capture
 
-from processing.diagnosis.captures.noise import estimated_noise
+from processing.diagnosis.captures.unstated_noise import estimated_noise
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block, noise_information

@@ -1,4 +1,4 @@
-"""The noise of a capture: as declared, unless its own images show another; estimated where nothing is declared.
+"""The noise of a capture: as declared, unless its own images show another.
 
 The model's rows, and what the residual of all pixels has in common, are subtracted. Differences of pixels a few apart
 then have twice the variance of the noise, whatever the instrument does. How that depends on distance, direction and
@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData, SharedNoise
@@ -31,8 +30,6 @@ from processing.instrument.grammar import TIMES, course
 from processing.reduction.noise import QUANTIZATION
 from processing.storage.captures.capture import CaptureError
 
-#: [intensities of a pixel] Up to which every row tells noise that has any: there are no others.
-FEW_ROWS = 4
 #: [pixels] Along a side of an image, below which it tells nothing about noise.
 NARROWEST = 12
 #: [directions] Over the states that the model leaves over, below which they tell nothing about noise.
@@ -48,86 +45,6 @@ NOISE_OFF_MIXED = 0.15
 NOISE_ALIKE = 0.05
 #: [of the median] Brightness from which on a pixel is lit.
 LIT = 0.5
-
-#: [components, fixed] Of the states that count as signal: a Mueller matrix has 16 unknowns.
-COMPONENTS = 16
-#: [pixels] That are looked at.
-PIXELS = 20_000
-#: [of the mean variance] Least variance without light.
-LEAST_FLOOR = 0.01
-#: [digits] Of the range of the signal, to which two signals are the same.
-DIGITS = 9
-#: [levels] Of the signal at which their scatter is told.
-LEVELS = 24
-
-
-def estimated_noise(data: CaptureData) -> CaptureData:
-    """The capture with variance = slope * signal + floor as its own pixels show it.
-
-    The leading components over all pixels are taken away from each pixel (16 at most, so an unknown sample and any
-    instrument error that is linear in it are gone); what is left, binned over the signal, gives the line. Structure
-    over the image that is left as well makes the estimate too large, never too small.
-    """
-    picked = np.flatnonzero((data.usable & ~data.clipped).reshape(-1))
-    if picked.size > PIXELS:
-        picked = picked[:: picked.size // PIXELS + 1]
-    y = data.signal.reshape(data.values_per_pixel, -1)[:, picked].astype(np.float64)
-    most = COMPONENTS if data.sample is None else 2
-    none = np.ones((len(y), 1))
-    slope, floor = _line_of_scatter(y, none, none[:1], min(most, len(y) - 1, max(picked.size // 4, 1)))
-    # In units of that noise, as it is by rows and by pixels, components that are no larger than noise show; they would
-    # take away the noise of the brightest.
-    variance = slope * np.maximum(y, 0) + floor
-    of_row, of_pixel = (np.sqrt(variance.mean(axis=axis, keepdims=True)) for axis in (1, 0))
-    of_pixel /= np.sqrt(variance.mean())
-    size = np.linalg.eigvalsh(_squared(y / of_row / of_pixel)) / picked.size
-    keep = int(np.sum(size > (1 + np.sqrt(len(y) / picked.size)) ** 2))
-    slope, floor = _line_of_scatter(y, of_row, of_pixel, min(keep, most, len(y) - 1))
-    n = data.signal.shape[0]
-    return replace(
-        data,
-        slope=np.full(n, slope),
-        floor=np.full(n, floor),
-        noise_known=True,
-        noise_estimated=True,
-        noise_source="estimated from the scatter over pixels that is left after the leading components of the states",
-    )
-
-
-def _line_of_scatter(y: Array, of_row: Array, of_pixel: Array, keep: int) -> tuple[float, float]:
-    """Slope and floor of the scatter of y (L, P) that `keep` components leave of it, over (L, 1) and (1, P)."""
-    z = y / of_row / of_pixel
-    u, size, _ = np.linalg.svd(_squared(z))
-    along, u = (u[:, :keep].T @ z) ** 2 / size[:keep, None], u[:, :keep]
-    outside = of_row * (np.eye(len(y)) - u @ u.T) / of_row.T
-    residual = outside @ y
-    # What is left of one row has noise of the others. Rows and pixels that the components follow closely have less.
-    of_noise = outside**2
-    share = of_noise.sum(axis=1, keepdims=True)
-    good = (share > (SMALL if len(y) > FEW_ROWS else 0.0))[:, 0]
-    square = residual[good] ** 2 / share[good] / np.maximum(1 - along.sum(axis=0), SMALL)
-    signal = ((of_noise / share) @ np.maximum(y - residual, 0))[good]
-    # Signals that rounding alone sets apart share a level, or it would hang on the processor's order of sums.
-    alike = np.round(signal / max(float(np.ptp(signal)), 1e-300), DIGITS)
-    edges = np.quantile(alike, np.linspace(0, 1, LEVELS + 1))
-    level = np.clip(np.searchsorted(edges, alike, side="right") - 1, 0, LEVELS - 1)
-    count = np.bincount(level.reshape(-1), minlength=LEVELS)
-    mean = np.bincount(level.reshape(-1), signal.reshape(-1), LEVELS) / np.maximum(count, 1)
-    variance = np.bincount(level.reshape(-1), square.reshape(-1), LEVELS) / np.maximum(count, 1)
-    weight = np.sqrt(count) / np.maximum(variance, 1e-12)
-    (slope, floor), _ = nnls(
-        np.stack([np.maximum(mean, 0), np.ones(LEVELS)], axis=1) * weight[:, None], variance * weight
-    )
-    # Counts of zero have a noise all the same: where the line leads to none, they would weigh as much as they like.
-    floor = max(floor, LEAST_FLOOR * float(np.mean(square)), 1e-12)
-    # Weighted as it will be used, the scatter must come out as one.
-    correction = float(np.mean(square / (slope * np.maximum(signal, 0) + floor)))
-    return slope * correction, floor * correction
-
-
-def _squared(x: Array) -> Array:
-    return np.asarray(x @ x.T)
-
 
 #: [intensities] Of the image that are looked at: enough for a part in a thousand of the noise.
 MOST_VALUES = 4_000_000

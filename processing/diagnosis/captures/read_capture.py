@@ -16,8 +16,8 @@ from processing.calibration.known_sample import known_mueller
 from processing.diagnosis.captures.binning import means, side_for, squares
 from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.captures.dark_noise import without_noise_of_darks
-from processing.diagnosis.captures.noise import estimated_noise
 from processing.diagnosis.captures.rounding import Rounding
+from processing.diagnosis.captures.unstated_noise import estimated_noise
 from processing.diagnosis.search.rules import (
     FEWEST_PIXELS,
     LIMIT,

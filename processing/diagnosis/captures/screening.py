@@ -17,9 +17,10 @@ from processing.arrays import Array
 from processing.computing.filters import separable
 from processing.diagnosis.captures.binning import averaged_for_fits
 from processing.diagnosis.captures.capture_data import CaptureData, LeftOut
-from processing.diagnosis.captures.noise import checked_noise, estimated_noise
+from processing.diagnosis.captures.noise import checked_noise
 from processing.diagnosis.captures.outliers import bad_frames, outliers_of, remove_outliers
 from processing.diagnosis.captures.read_capture import without_dark_pixels
+from processing.diagnosis.captures.unstated_noise import estimated_noise
 from processing.instrument.applied_effects import changes_of
 from processing.instrument.model import InstrumentModel
 from processing.reduction.move_image import taps

@@ -154,18 +154,16 @@ def _expand(
     first = look(start)
     assert first is not None, "the instrument as declared has no intensities"
     begun: list[_Round | None] = [first]
-    # A large cause is far from linear: first many others explain it, from which no straight line leads back to it.
-    odds = np.where(first.sets.free, first.sets.conditional(first.sets.empty(), follow=True).log_odds, -np.inf)
-    is_far = first.state.unit > BENT or not problem.noise_known
-    by_themselves = {int(np.argmax(odds))} if is_far or odds.max() > NEEDED else set()
-    if is_far:
+    if first.state.unit > BENT or not problem.noise_known:
         # Several large causes, none of which explains much alone, or far from linear: from all of them at once as well.
         begun.append(look(all_at_once(problem, space, fixed, start, noise=first.sets.noise, tau=TAU[-1])))
-        bent = (g for g, indices in enumerate(members) if space.candidates[indices[0]].effect.has_bent_valley)
-        by_themselves.update(bent)
-    for g in sorted(by_themselves):
-        trial = look(alone(problem, space, members[g]), np.arange(len(groups)) == g)
-        begun += [trial] if trial is not None and trial.score > first.score else []
+        single = [g for g, indices in enumerate(members) if space.candidates[indices[0]].effect.has_bent_valley]
+    else:
+        # One large cause: many others can explain it together, from which no straight line leads back to it.
+        odds = np.where(first.sets.free, first.sets.conditional(first.sets.empty(), follow=True).log_odds, -np.inf)
+        single = [int(np.argmax(odds))] if odds.max() > NEEDED else []
+    by_itself = [look(alone(problem, space, members[g]), np.arange(len(groups)) == g) for g in single]
+    begun += [trial for trial in by_itself if trial is not None and trial.score > first.score]
     rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
     ended = [_settle(problem, space, trial, look, rounds=rounds) for trial in begun if trial is not None]
     last = max(ended, key=lambda trial: trial.score)
