@@ -71,8 +71,8 @@ def check_plan(plan: MeasurementPlan, rig: RigConfig) -> list[CheckResult]:
     checks = [_member("mode", plan.mode, list(rig.modes))]
     wavelengths = [f"{w:g}" for w in rig.wavelengths_nm]
     checks.append(_member("wavelength_nm", f"{plan.wavelength_nm:g}", wavelengths))
-    if rig.simulator is not None:
-        checks.append(_member("sample", plan.sample.name or plan.sample.kind, sorted(rig.simulator.samples)))
+    if rig.sample_names is not None:
+        checks.append(_member("sample", plan.sample.name or plan.sample.kind, rig.sample_names))
     try:
         turning = plan.states.angles_deg(rig.named_states())
     except ConfigError as error:

@@ -14,9 +14,7 @@ from processing.storage.captures.schema import CaptureHeader
 from processing.yaml_file import dump_yaml
 
 
-def capture_header(
-    plan: MeasurementPlan, config: RigConfig, instrument: InstrumentModel, rig: Rig, *, seed: int | None
-) -> CaptureHeader:
+def capture_header(plan: MeasurementPlan, config: RigConfig, instrument: InstrumentModel, rig: Rig) -> CaptureHeader:
     """The header of a capture that is about to start, with settings and devices as read back."""
     camera = rig.require_camera()
     mosaic = instrument.mosaic
@@ -38,7 +36,7 @@ def capture_header(
         camera_settings_json=camera.settings.model_dump_json(),
         devices_json=json.dumps(rig.describe(), default=str),
         versions=versions(),
-        seed=seed,
+        seed=config.seed,
         folded_deg=dict(config.fold_deg),
         voltages={axis: dict(entry.named_states()) for axis, entry in config.axes.items() if entry.unit == "V"},
         camera_nodes=camera.node_map(),

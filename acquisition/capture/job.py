@@ -43,7 +43,6 @@ class Job:
     instrument: InstrumentModel
     table: StateTable
     checks: tuple[CheckResult, ...]
-    seed: int | None = None
     exposure_known: bool = True
     first: int = 0
 
@@ -80,8 +79,7 @@ def prepare(plan: MeasurementPlan, rig: RigConfig, read: ReadInstrument = Instru
     table = plan.state_table(standing_pose_deg(plan, rig), exposure_s, rig.named_states())
     checks += check_table(table, rig, instrument)
     refuse_failed(checks)
-    seed = rig.simulator.seed if rig.simulator else None
-    return Job(plan, rig, instrument, table, tuple(checks), seed, not isinstance(plan.exposure_s, AutoExposure))
+    return Job(plan, rig, instrument, table, tuple(checks), not isinstance(plan.exposure_s, AutoExposure))
 
 
 def check_with_devices(

@@ -10,17 +10,10 @@ from pathlib import Path
 from acquisition.capture.checks import CheckResult
 from acquisition.rig.config import RigConfig
 from processing.errors import ProcessError
-from processing.instrument.model import InstrumentModel
-from simulators.bench.scene import Scene
 
 
-def check_machine(rig: RigConfig, samples: Iterable[str]) -> list[CheckResult]:
-    """Programs of `alert` and `notify`, scenes of samples, and the instruments that an emulated bench truly is.
-
-    Parameters
-    ----------
-    samples : names as in `simulator.samples`.
-    """
+def check_machine(rig: RigConfig, samples: Iterable[str] | None = None) -> list[CheckResult]:
+    """Programs of `alert` and `notify`, and files that an emulated bench needs for these samples, or for all."""
     checks = []
     commands = {"alert": rig.alert, "notify": rig.notify.command if rig.notify else ()}
     for key, command in commands.items():
@@ -28,13 +21,7 @@ def check_machine(rig: RigConfig, samples: Iterable[str]) -> list[CheckResult]:
             program = shutil.which(command[0])
             lacking = f"there is no program {command[0]!r} here: nobody would be called"
             checks.append(CheckResult(key, program is not None, program or lacking))
-    if rig.simulator is not None:
-        for name in dict.fromkeys(samples):
-            if name in rig.simulator.samples:
-                checks.append(_check_file(f"scene {name}", rig.simulator.samples[name], Scene.load))
-        for mode, path in rig.simulator.truth.items():
-            checks.append(_check_file(f"truth of {mode}", path, InstrumentModel.load))
-    return checks
+    return [*checks, *(_check_file(*file) for file in rig.bench_files(samples))]
 
 
 def _check_file(title: str, path: Path, load: Callable[[Path], object]) -> CheckResult:

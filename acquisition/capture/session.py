@@ -59,7 +59,7 @@ def take(
         table=unwind(fold_angles(job.table, rig), rig),
         instrument=match_mosaic(job.instrument, rig.require_camera()),
     )
-    header = capture_header(job.plan, job.rig, job.instrument, rig, seed=job.seed)
+    header = capture_header(job.plan, job.rig, job.instrument, rig)
     begin = begin_record(job, rig, 0)
     writer = CaptureWriter.create(
         path, header, job.table, frame_shape(rig), start_time=now(), begin=begin, clock=rig.clock

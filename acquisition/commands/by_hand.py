@@ -180,7 +180,9 @@ def _load(rig: Path | None) -> RigConfig:
 
 
 def _say_ended(config: RigConfig) -> None:
-    if config.simulator is not None:
+    from acquisition.rig.config import has_own_emulators
+
+    if has_own_emulators(config):
         typer.echo("the emulators of this rig end with this command: the next one finds them as they were at first")
 
 

@@ -20,7 +20,7 @@ from acquisition.campaign.summary import SUMMARY, summary_lines
 from acquisition.capture.checks import CheckResult, refuse_failed
 from acquisition.capture.operator import Operator
 from acquisition.commands.defaults import DEFAULT_RIG, INTERRUPTED
-from acquisition.commands.single import Options, live_page, load_user_rig, say_simulated, show_checks, with_seed
+from acquisition.commands.single import Options, live_page, load_user_rig, say_simulated, show_checks
 from acquisition.disc import disc_process, on_disc
 from acquisition.errors import AcquisitionError
 from acquisition.rig.open_rig import open_rig
@@ -47,7 +47,7 @@ def _run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Ob
     _refuse_with_campaign(options, file)
     campaign = Campaign.load(file)
     rig_file = options.rig or _rig_of(campaign, file) or DEFAULT_RIG
-    rig_config = with_seed(load_user_rig(rig_file), options.seed)
+    rig_config = load_user_rig(rig_file).with_seed(options.seed)
     jobs = campaign_run.prepare(campaign, rig_config)
     identity = campaign_identity(campaign, jobs, rig_config, rig_file.resolve())
     folder = folder_for(options.out / campaign.name, identity, options.as_new)

@@ -54,11 +54,11 @@ def examine(config: RigConfig, folder: Path, frames: int = FRAMES) -> Iterator[F
     yield Finding("disc", free > 1e9, f"{free / 1e9:.1f} GB free in {folder.resolve()}")
     for name, mode in config.modes.items():
         yield _guarded(f"mode {name}", lambda mode=mode: _instrument(mode.instrument))  # type: ignore[misc]
-    for check in check_machine(config, config.simulator.samples if config.simulator else ()):
+    for check in check_machine(config):
         yield Finding(check.title, check.passed, check.detail)
     rig = open_rig(config)
     try:
-        yield _guarded("emulators", rig.start) if config.simulator else Finding("rig", None, config.name)
+        yield _guarded("rig", rig.start)
         for name in config.axes:
             yield _guarded(f"axis {name}", lambda name=name: describe_axis(rig.open_axis(name)))  # type: ignore[misc]
         if config.source is not None:

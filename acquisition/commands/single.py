@@ -145,7 +145,7 @@ def own_rig_of(capture: Capture, exactly: bool) -> RigConfig:
     equal = []
     for file in (*own_rigs(stored.name), DEFAULT_RIG):
         with contextlib.suppress(ProcessError):
-            rig = with_seed(load_rig(file), stored.simulator.seed if stored.simulator else None)
+            rig = load_rig(file).with_seed(stored.seed)
             if mode in rig.modes and rig_content(rig, mode) == rig_content(stored, mode):
                 return rig
             if file != DEFAULT_RIG:
@@ -206,18 +206,7 @@ def sample_of(name: str) -> Sample:
 
 def rig_of(options: Options) -> RigConfig:
     """The rig file, or the simulated rig."""
-    return with_seed(load_user_rig(options.rig or DEFAULT_RIG), options.seed)
-
-
-def with_seed(rig: RigConfig, seed: int | None) -> RigConfig:
-    """The rig with another seed of its simulated noise. Raises ConfigError for a real rig."""
-    if seed is None:
-        return rig
-    if not 0 <= seed < 1 << 63:
-        raise ConfigError(f"--seed {seed}: a seed is a whole number from 0 to 2^63")
-    if rig.simulator is None:
-        raise ConfigError(f"--seed {seed}: rig {rig.name!r} has no simulator, its noise has no seed")
-    return rig.model_copy(update={"simulator": rig.simulator.model_copy(update={"seed": seed})})
+    return load_user_rig(options.rig or DEFAULT_RIG).with_seed(options.seed)
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """The rig file: devices and ports, forbidden poses, and devices that the simulator replaces."""
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -49,6 +49,30 @@ class RigConfig(RigSections):
     def named_states(self) -> dict[str, Mapping[str, float]]:
         """For each axis that has names for its positions, these."""
         return {name: named for name, entry in self.axes.items() if (named := entry.named_states())}
+
+    @property
+    def seed(self) -> int | None:
+        """Seed of the simulated noise; None for a real rig."""
+        return self.simulator.seed if self.simulator else None
+
+    def with_seed(self, seed: int | None) -> "RigConfig":
+        """The rig with another seed of its simulated noise. Raises ConfigError for a real rig."""
+        if seed is None:
+            return self
+        if not 0 <= seed < 1 << 63:
+            raise ConfigError(f"--seed {seed}: a seed is a whole number from 0 to 2^63")
+        if self.simulator is None:
+            raise ConfigError(f"--seed {seed}: rig {self.name!r} has no simulator, its noise has no seed")
+        return self.model_copy(update={"simulator": self.simulator.model_copy(update={"seed": seed})})
+
+    @property
+    def sample_names(self) -> list[str] | None:
+        """Names of the samples that the rig can show; None where an operator places any sample."""
+        return sorted(self.simulator.samples) if self.simulator else None
+
+    def bench_files(self, samples: Iterable[str] | None) -> Iterator[tuple[str, Path, Callable[[Path], object]]]:
+        """Title, path and reader of each file that an emulated bench needs for these samples, or for all (None)."""
+        return self.simulator.files(samples) if self.simulator else iter(())
 
     @model_validator(mode="after")
     def _own_emulators_are_simulated(self) -> Self:

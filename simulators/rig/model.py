@@ -1,13 +1,16 @@
 """The `simulator` section of a rig file: emulators, the scene, and the truth that the declared rig may not know."""
 
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from pydantic import Field
 
+from processing.instrument.model import InstrumentModel
 from processing.section import Section
 from processing.storage.captures.schema import Detector
 from simulators.bench.bench import DARK_CURRENT_E_PER_S, DETECTOR
 from simulators.bench.effects import AnyBenchEffect
+from simulators.bench.scene import Scene
 from simulators.camera.genicam.description_file import is_description
 
 #: A device whose port reads `sim:NAME` stands at the emulator of that name.
@@ -72,6 +75,14 @@ class SimulatorConfig(Section):
     camera_wait_s: float = Field(default=10.0, ge=0, description="wait for that address while another run has it")
     packet_loss: float = Field(default=0.0, ge=0, lt=1, description="part of the camera's packets that are lost")
     stamp: bool = Field(default=False, description="write the true angles into the pixels, for tests")
+
+    def files(self, samples: Iterable[str] | None = None) -> Iterator[tuple[str, Path, Callable[[Path], object]]]:
+        """Title, path and reader of each file of the bench: scenes of these samples or of all, and `truth`."""
+        for name in dict.fromkeys(self.samples if samples is None else samples):
+            if name in self.samples:
+                yield f"scene {name}", self.samples[name], Scene.load
+        for mode, path in self.truth.items():
+            yield f"truth of {mode}", path, InstrumentModel.load
 
     def below(self, folder: Path) -> "SimulatorConfig":
         """The same with its relative paths made absolute, from `folder`."""
