@@ -224,6 +224,8 @@ class Setup:
             self._features.set_flag(name, True)
 
     def _clear_offsets(self) -> None:
+        if "Region0" in self._features.choices("RegionSelector") and "RegionSelector" not in self._config.features:
+            self._features.set_choice("RegionSelector", "Region0")
         # They limit the size. One at zero is left alone: while the size is too large for a new binning, zero is more
         # than its limit.
         for offset in ("OffsetX", "OffsetY"):
@@ -318,7 +320,7 @@ class Setup:
     def require_known_state(self) -> None:
         """Read once more what must do nothing, after everything is set. Raises SettingRefused where it does not."""
         self._neutral.require()
-        self._delay_s = self.light.delay_s()
+        self._delay_s = self.light.delay_s(self._config.features)
         self.converter_bits = self.light.converter_bits()
 
     def _require_free(self, setting: str, *names: str) -> None:

@@ -8,11 +8,13 @@ others.
 
 import math
 import re
+from collections.abc import Collection
 from typing import Literal
 
 from drivers import genicam
 from drivers.errors import CameraError, CameraLost, SettingRefused, ignore_refusals
 from drivers.genicam import Features
+from drivers.neutral_features import DELAYS, rule_for
 from drivers.pixel_formats import PixelFormat
 
 _RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
@@ -93,16 +95,30 @@ class ExposureAndGain:
         value = self._features.number(genicam.EXPOSURE_US)
         return None if name is None or value is None else value * self._unit_s(name)
 
-    def delay_s(self) -> float:
-        """Time from the trigger of a frame to the start of its exposure, as the camera has it set."""
-        name = self._features.find(("TriggerDelay", "TriggerDelayAbs"))
+    def delay_s(self, features: Collection[str]) -> float:
+        """Time from the trigger of a frame to the start of its exposure, as the camera has it set.
+
+        `features` are those of the rig file, which may have a delay under a name of the maker's.
+        """
         enabled = self._features.find(("TriggerDelayEnabled", "TriggerDelayEnable"))
-        if name is None or (enabled is not None and self._features.value(enabled) in (False, "Off")):
+        if enabled is not None and self._features.value(enabled) in (False, "Off"):
             return 0.0
-        return (self._features.number((name,)) or 0.0) * self._unit_s(name)
+        usual = self._features.find(("TriggerDelay", "TriggerDelayAbs"))
+        names = {name for name in (usual, *features) if name is not None and rule_for(name) is DELAYS}
+        delays = {name: self._features.number((name,)) or 0.0 for name in names}
+        least = {name: 0.0 if name in features else self._features.limits(name)[0] for name in names}
+        return max((value * self._unit_s(name) for name, value in delays.items() if value > least[name]), default=0.0)
 
     def _unit_s(self, name: str) -> float:
-        return genicam.SECONDS.get(self._features.unit(name).strip().lower(), 1e-6)
+        unit = self._features.unit(name)
+        unit_s = None if name.endswith("Raw") and not unit else genicam.seconds_of(unit)
+        if unit_s is None:
+            raise SettingRefused(
+                f"camera {self._name}, a time by {name}",
+                f"it counts in {unit or 'steps of the camera'}, and how long one is stands nowhere",
+                f"Leave {name} out of `features`, or use a camera that takes times in parts of a second",
+            )
+        return unit_s
 
     def _lower_rate(self, exposure_s: float) -> None:
         features = self._features

@@ -4,6 +4,7 @@ Cameras accept values that they do not keep: on Aravis' own camera an exposure o
 as 3.57e9. So limits are checked before a value is written, and what is read back decides.
 """
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Literal, TypeVar
@@ -24,17 +25,26 @@ PACKET_DELAY = ("GevSCPD",)
 SERIAL_NUMBER = ("DeviceSerialNumber", "DeviceID")
 FIRMWARE = ("DeviceFirmwareVersion", "DeviceVersion")
 
-#: Seconds of units of time; microseconds, which the SFNC has, where the unit is none of them.
-SECONDS = dict.fromkeys(("us", "µs", "μs", "usec"), 1e-6) | dict.fromkeys(("ms", "msec"), 1e-3)
-SECONDS |= {"ns": 1e-9, "s": 1.0, "sec": 1.0}
+_UNIT_OF_TIME = re.compile(r"(µ|μ|u|micro|m|milli|n|nano|)\s?s(ec(ond)?s?)?")
+_SCALES = {"m": 1e-3, "milli": 1e-3, "n": 1e-9, "nano": 1e-9, "": 1.0}
 _DECIBEL, _FACTOR = ("db", "decibel", "decibels"), ("x", "factor", "times", "ratio", "fold", "multiplier")
 
 T = TypeVar("T")
 
 
+def _plain(unit: str) -> str:
+    return unit.strip().strip("[]()").lower()
+
+
+def seconds_of(unit: str) -> float | None:
+    """Seconds of a unit of time: microseconds, which the SFNC has, where there is none; None for another unit."""
+    match = _UNIT_OF_TIME.fullmatch(_plain(unit) or "us")
+    return None if match is None else _SCALES.get(match[1], 1e-6)
+
+
 def gain_unit(unit: str) -> Literal["dB", "factor"] | None:
     """What the unit of a Gain feature means; None where its description does not say."""
-    word = unit.strip().strip("[]()").lower()
+    word = _plain(unit)
     return "dB" if word in _DECIBEL else "factor" if word in _FACTOR else None
 
 
@@ -104,7 +114,7 @@ class Features:
         if name is None:
             return None
         with self.asking(f"read {name}"):
-            if self._is_float(name):
+            if self.is_float(name):
                 return float(self._camera.get_float(name))
             return float(self._camera.get_integer(name))
 
@@ -137,7 +147,7 @@ class Features:
         if name is None:
             raise self._refused(f"set {names[0]} to {value:g}", "this camera has no such feature")
         with self.asking(f"set {name} to {value:g}"):
-            if self._is_float(name):
+            if self.is_float(name):
                 low, high = self._camera.get_float_bounds(name)
                 step = max(self._step(name), floor, 1e-3 * abs(value))
                 self._check_limits(name, value, low, high)
@@ -311,7 +321,7 @@ class Features:
     def limits(self, name: str) -> tuple[float, float]:
         """Lowest and highest value of a number now."""
         with self.asking(f"read the limits of {name}"):
-            is_float = self._is_float(name)
+            is_float = self.is_float(name)
             low, high = (self._camera.get_float_bounds if is_float else self._camera.get_integer_bounds)(name)
         return float(low), float(high)
 
@@ -357,7 +367,8 @@ class Features:
         with self.asking(f"execute {name}"):
             self._camera.execute_command(name)
 
-    def _is_float(self, name: str) -> bool:
+    def is_float(self, name: str) -> bool:
+        """True for a number that need not be whole."""
         return isinstance(self._device.get_feature(name), self._aravis.GcFloat)
 
     def _step(self, name: str) -> float:

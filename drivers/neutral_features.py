@@ -6,7 +6,9 @@ of the EPICS ADGenICam module: Allied Vision, Basler, FLIR, Point Grey, Adimec, 
 A rule is a pattern, so it also matches similar names that are not in those lists.
 """
 
+import math
 import re
+import time
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -16,6 +18,9 @@ from drivers.genicam import EXPOSURE_US, Features
 
 # What makers call an enumeration's entry that switches something off.
 _OFF_WORDS = ("Off", "None", "Disabled", "Disable", "False", "No", "Normal", "Standard", "Linear", "LiveVideo")
+_OFF_ENDS = ("off", "none", "disabled", "notest", "nopattern")
+# Some cameras go on loading after they have answered.
+_LOAD_S = 2.0
 _DEFAULT_SETS = ("Default", "Factory", "Standard", "FactoryDefault", "Default0", "DefaultSet")
 _LOADS = (
     ("UserSetSelector", "UserSetLoad"),
@@ -30,9 +35,10 @@ _SELECTED_BY = {
     "BalanceRatio": "BalanceRatioSelector",
     "CorrectionMode": "CorrectionSelector",
     "ROIZoneMode": "ROIZoneSelector",
+    "RegionMode": "RegionSelector",
 }
 
-Neutral = Literal["off", "least", "one"] | tuple[str, ...]
+Neutral = Literal["off", "least", "one", "unity"] | tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,17 +48,22 @@ class Rule:
     Attributes
     ----------
     names : str
-        Regular expression for the whole name.
-    neutral : {"off", "least", "one"} or tuple of str
-        Off: false, an entry that means off, or zero; least: the lower limit; one: 1; else the entries that will do.
+        Regular expression for the whole name without underscores, in any case of its letters.
+    neutral : {"off", "least", "one", "unity"} or tuple of str
+        Off: false, an entry that means off, or zero; least: the lower limit; one: a count of 1; unity: a factor of 1,
+        which is not known where it is a whole number of other parts; else the entries that will do.
     harm : bool
-        True where the counts or the time of the exposure are wrong as long as it is set: no capture is taken then.
+        True where the counts or the time of the exposure are wrong as long as it is set: no capture is taken then, also
+        where its neutral value is not known.
     """
 
     names: str
     neutral: Neutral
     harm: bool
 
+
+#: From a trigger to the start of its exposure.
+DELAYS = Rule(r"(\w*Trigger|Trig|Exposure(Start)?)Delay(Abs|Raw|Time)?", "least", True)
 
 RULES = (
     # The image is not that of the sensor, or holds more than it.
@@ -63,29 +74,34 @@ RULES = (
     Rule(r"GevSCPSBigEndian|\w*PixelBigEndian|ImageCompressionMode|\w*LossyCompression\w*Enable", "off", True),
     # Settings change from frame to frame.
     Rule(
-        r"\w*(Exposure|Gain|BlackLevel|White|WhiteBalance|Brightness|Contrast|Gamma|ExposureCompensation|BalanceRatio)Auto",
+        r"\w*(Exposure|Gain|BlackLevel|White|WhiteBalance|Brightness|Contrast|Gamma|ExposureCompensation|BalanceRatio)Auto"
+        r"(Enable|Enabled)?|Auto(Exposure|Gain|BlackLevel|White(Balance)?|Brightness|Contrast)(Mode|Enable|Enabled)?",
         "off",
         True,
     ),
     Rule(r"(Sequencer|Sequence|Bsl\w*Sequencer)(Configuration)?(Mode|Enable|Enabled)", "off", True),
-    Rule(r"\w*(HDR|Hdr|WDR|MultiExposure|MultiSlope|PieceWise\w*)_?(Mode|ModeEnabled?|Enabled?)?", "off", True),
+    Rule(r"\w*(HDR|WDR|MultiExposure|MultiSlope|PieceWise\w*)(Mode|ModeEnabled?|Enabled?)?", "off", True),
     Rule(r"\w*(Hue|Saturation|Sharpness|Sharpening|FrameRate|Iris|Focus|Defog|Flicker\w*)Auto", "off", False),
     # The exposure does not begin with its trigger.
     Rule(r"(\w*Trigger|Exposure(Start)?)Delay(Enable|Enabled)", "off", True),
-    Rule(r"(\w*Trigger|Trig|Exposure(Start)?)Delay(Abs|Raw|Time)?", "least", True),
+    DELAYS,
     Rule(r"TriggerOverlap", "off", False),
     Rule(r"Trigger(Divider|Multiplier)|AcquisitionBurstFrameCount", "one", True),
-    Rule(r"EnableBurstAcquisition|BurstModeEnable|PtpAcquisitionGateTime|StreamHoldEnable", "off", True),
+    Rule(
+        r"EnableBurstAcquisition|BurstModeEnable|PtpAcquisitionGateTime|StreamHoldEnable|TriggerCacheEnable",
+        "off",
+        True,
+    ),
     Rule(r"TransferControlMode", ("Automatic", "Basic"), True),
     Rule(r"\w*(Averag(e|ing)\w*(Number|Count|Frames)\w*|FrameAverag\w*|FrameIntegration\w*Count)", "one", True),
     Rule(r"\w*(Averag(e|ing)|FrameIntegration)(Mode|Enable)", "off", True),
     # Counts are not linear in light, or not in the unit of the converter.
-    Rule(r"\w*(Gamma|LUT|Contrast|ToneMapping|Dehaze|Defog)(Enable|Enabled|CorrectionEnable)", "off", True),
-    Rule(r"Gamma(Abs)?", "one", True),
-    Rule(r"\w*ContrastMode", ("Linear", "Off", "ContrastMode_Off"), True),
+    Rule(r"\w*(Gamma|LUT|Contrast|ToneMapping|Dehaze|Defog)(Enable|Enabled|CorrectionEnable)|LUTMode", "off", True),
+    Rule(r"Gamma(Abs)?", "unity", True),
+    Rule(r"\w*ContrastMode", "off", True),
     Rule(r"Bsl(Brightness|Contrast)(Raw)?|BlackLevelOffsetDigital", "off", True),
     Rule(r"DigitalShift", "off", True),
-    Rule(r"\w*DigitalGain\w*", "one", False),
+    Rule(r"\w*DigitalGain\w*", "unity", False),
     # A pixel holds the light of its neighbours, which are other analyzers on a mosaic.
     Rule(r"\w*(Sharpen(ing)?|Denois(e|ing)|MedianFilter)(Enable|Enabled|Mode)?", "off", True),
     Rule(r"\w*(Sharpness|(?<!Pattern)NoiseReduction)(Enable|Enabled|Mode)", "off", True),
@@ -101,23 +117,25 @@ RULES = (
     Rule(r"VendorDefectPixelCorr|BsliDPC[EH]|(HotPixel|\w*Defective\w*|FlatField)Correction", "off", False),
     # A factor for each pixel or colour, the same for every frame.
     Rule(
-        r"\w*(Ffc|FFC|FlatField|FlatFieldCorrection|Shading|LensShading|Vignetting)(Correction)?(Mode|Enable)",
+        r"\w*(FFC|FlatField|FlatFieldCorrection|Shading|LensShading|Vignetting)(Correction)?(Mode|Enable)",
         "off",
         False,
     ),
-    Rule(r"BalanceRatio(Abs)?", "one", False),
+    Rule(r"BalanceRatio(Abs)?", "unity", False),
     Rule(r"LightSource(Selector|Preset)", "off", False),
     Rule(r"\w*(ColorTransformation|ColorAdjustment|ColorCorrection|Saturation|Hue)(Mode|Enable|Enabled)", "off", False),
     # Which pixels are read.
-    Rule(r"Center[XY]|\w*Multi(ple)?(ROI|Roi|Region)\w*Enable|StackedZoneImaging\w*Enable|ROIZoneMode", "off", True),
-    Rule(r"LegacyBinning(Horizontal|Vertical)|\w*Interlac\w*Enable", "off", True),
-    Rule(r"Scaling(Horizontal|Vertical)(Abs)?", "one", True),
-    Rule(r"DeviceScanType", ("Areascan", "AreaScan"), True),
+    Rule(
+        r"Center[XY]|\w*Multi(ple)?(ROI|Region)\w*Enable|StackedZoneImaging\w*Enable|(ROIZone|Region)Mode", "off", True
+    ),
+    Rule(r"LegacyBinning(Horizontal|Vertical)|\w*(Interlac|Binning)\w*Enable", "off", True),
+    Rule(r"Scaling(Horizontal|Vertical)(Abs)?", "unity", True),
+    Rule(r"DeviceScanType", ("Areascan",), True),
     # The clock of the exposure.
     Rule(r"ExposureTimeMode|ExposureTimeSelector", ("Standard", "Common", "Timed"), True),
     Rule(r"ShortExposureEnable|ExposureTimeBaseAbsEnable|GlobalResetReleaseModeEnable", "off", True),
 )
-_COMPILED = tuple((re.compile(rule.names), rule) for rule in RULES)
+_COMPILED = tuple((re.compile(rule.names, re.IGNORECASE), rule) for rule in RULES)
 
 # Writable features that say nothing of counts or times of frames: the link, lines that go out, what a program reads.
 _NO_MATTER = re.compile(
@@ -131,7 +149,19 @@ _NO_MATTER = re.compile(
 
 def rule_for(name: str) -> Rule | None:
     """The first rule whose pattern is that of a feature's name; None for a name that no rule knows."""
-    return next((rule for pattern, rule in _COMPILED if pattern.fullmatch(name)), None)
+    return next((rule for pattern, rule in _COMPILED if pattern.fullmatch(name.replace("_", ""))), None)
+
+
+def _text(value: str | float | bool) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _entry(words: Collection[str], entries: list[str]) -> str | None:
+    """The entry that is the first of the words in any case of its letters, or ends like one that means off."""
+    by_plain = {entry.replace("_", "").lower(): entry for entry in entries}
+    exact = next((by_plain[word.lower()] for word in words if word.lower() in by_plain), None)
+    ends = _OFF_ENDS if "Off" in words else ()
+    return exact or next((entry for plain, entry in by_plain.items() if plain.endswith(ends)), None)
 
 
 class NeutralFeatures:
@@ -175,7 +205,10 @@ class NeutralFeatures:
         if not self._is_loaded:
             self.remarks = list(self._load())
             self._is_loaded = True
-        for name, rule in self._rules:
+        self._set_all()
+
+    def _set_all(self) -> None:
+        for name, rule in self._rules or ():
             for _ in self._entries_of_selector(name):
                 self._set(name, rule)
 
@@ -188,6 +221,10 @@ class NeutralFeatures:
             One that spoils the frames is not neutral.
         """
         issues = list(self._not_neutral())
+        if issues:
+            # Some can only be set now that others are.
+            self._set_all()
+            issues = list(self._not_neutral())
         if harmful := [text for text, rule in issues if rule.harm]:
             raise SettingRefused(
                 f"camera {self._name}, bring it to a known state",
@@ -221,7 +258,7 @@ class NeutralFeatures:
             except CameraError as error:
                 yield from self._remark_unknown(f"the default settings were not loaded ({error.came_back})")
                 return
-            if probe is not None and self._value(probe[0]) == probe[1]:
+            if probe is not None and not self._is_over(*probe):
                 yield from self._remark_unknown(f"{load} of {preset} changed nothing, {probe[0]} stayed as it was")
             return
         yield from self._remark_unknown("this camera has no default settings to load")
@@ -237,6 +274,15 @@ class NeutralFeatures:
             if self._try(name, float(round(trial_us))) and isinstance(echo := self._value(name), float) and echo != now:
                 return name, echo
         return None
+
+    def _is_over(self, name: str, before: float) -> bool:
+        """Wait until a load has changed the probe; False if it does not."""
+        end_s = time.monotonic() + _LOAD_S
+        while self._value(name) in (None, before):
+            if time.monotonic() > end_s:
+                return False
+            time.sleep(0.01)
+        return True
 
     def _remark_unknown(self, why: str) -> Iterator[str]:
         names = [
@@ -259,7 +305,8 @@ class NeutralFeatures:
             return
         selected = features.text((selector,))
         for entry in entries:
-            if self._try(selector, entry):
+            # The first region is the image.
+            if (name, entry) != ("RegionMode", "Region0") and self._try(selector, entry):
                 yield
         self._try(selector, selected)
 
@@ -289,15 +336,16 @@ class NeutralFeatures:
             return False
         if kind == "choice":
             words = _OFF_WORDS if isinstance(rule.neutral, str) else rule.neutral
-            if rule.neutral == "one":
-                words = ("One", "ONE", "ONEX", "X1", "x1", "1x", "1", *_OFF_WORDS)
-            choices = self._features.choices(name)
-            return next((word for word in words if word in choices), None)
-        if kind != "number" or not isinstance(rule.neutral, str):
+            if rule.neutral in ("one", "unity"):
+                words = ("One", "OneX", "X1", "1x", "1", *_OFF_WORDS)
+            return _entry(words, self._features.choices(name))
+        unknown = rule.neutral == "unity" and not self._features.is_float(name)
+        if kind != "number" or not isinstance(rule.neutral, str) or unknown:
             return None
         with ignore_refusals():
             low, high = self._features.limits(name)
-            return min(max({"off": 0.0, "least": low, "one": 1.0}[rule.neutral], low), high)
+            neutral = {"off": 0.0, "least": low}.get(rule.neutral, 1.0)
+            return neutral if low <= neutral <= high else None
         return None
 
     def _not_neutral(self) -> Iterator[tuple[str, Rule]]:
@@ -306,15 +354,17 @@ class NeutralFeatures:
                 if self._features.find((name,)) is None:
                     continue
                 neutral, now = self._neutral_value(name, rule), self._value(name)
-                if neutral is None or now is None or now == neutral:
+                if now is None or now == neutral or self._is_switched_off(name):
                     continue
-                if isinstance(now, float) and isinstance(neutral, float):
-                    if abs(now - neutral) <= 1e-3 * max(1.0, abs(neutral)) or self._is_switched_off(name):
-                        continue
-                    yield f"{name} is {now:g} and could not be set to {neutral:g}", rule
-                else:
-                    yield f"{name} is {now} and could not be set to {neutral}", rule
+                if neutral is None:
+                    if rule.harm:
+                        yield f"{name} is {_text(now)}, and which of its values does nothing is not known", rule
+                    continue
+                numbers = isinstance(now, float) and isinstance(neutral, float)
+                if not (numbers and math.isclose(float(now), float(neutral), rel_tol=1e-3, abs_tol=1e-3)):
+                    yield f"{name} is {_text(now)} and could not be set to {_text(neutral)}", rule
 
     def _is_switched_off(self, name: str) -> bool:
-        """True where a flag says that a number is not used."""
-        return any(self._value(name + end) in (False, "Off") for end in ("Enable", "Enabled"))
+        """True where a flag says that a number or a mode is not used."""
+        stems = {name, name.removesuffix("Mode")}
+        return any(self._value(stem + end) in (False, "Off") for stem in stems for end in ("Enable", "Enabled"))

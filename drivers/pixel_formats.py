@@ -108,7 +108,8 @@ class PixelFormat:
 
         `memory` is the whole image as it came, `pixels` what `decode` made of it.
         """
-        if bits < self.bits - shift and int(pixels.max()) >> bits:
+        room = 16 if self.layout == "plain" and self.bits > 8 else self.bits
+        if bits < room - shift and int(pixels.max()) >> bits:
             return f"a count of {int(pixels.max())} needs more than {bits} bits"
         if shift and self.layout == "plain" and self.bits_in_memory == 16:
             size = 2 * pixels.size

@@ -18,7 +18,7 @@ _SEQUENCERS = ("SequencerMode", "SequenceEnable", "pgrHDRModeEnabled", "HDR_Mode
 _TABLES = ("LUTEnable", "ContrastEnable", "BslContrastMode", "ContrastMode")
 _FILTERS = ("SharpeningEnable", "SharpnessEnabled", "DenoisingEnable", "MedianFilter", "EdgeFilter", "ConvolutionMode")
 _DELAYS = ("TriggerDelay", "TriggerDelayAbs", "FrameStartTriggerDelay", "TrigDelay")
-_OFF = {"Off", "None", "Disabled", "Linear", "ContrastMode_Off", "Normal", "NoTest"}
+_OFF = ("Off", "None", "Disabled", "Linear", "linear", "Normal", "NoTest")
 
 
 class Settings(Protocol):
@@ -32,7 +32,7 @@ class Settings(Protocol):
 
 
 def _is_on(settings: Settings, names: tuple[str, ...]) -> bool:
-    return any((entry := settings.entry(name)) is not None and entry not in _OFF for name in names)
+    return any((entry := settings.entry(name)) is not None and not entry.endswith(_OFF) for name in names)
 
 
 def delay_s(settings: Settings) -> float:

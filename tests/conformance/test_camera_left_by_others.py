@@ -1,5 +1,6 @@
 """A camera as another program left it: each setting is brought to where it does nothing, or the capture is refused."""
 
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -38,12 +39,15 @@ def bench_camera(tmp_path: Path) -> Iterator[Left]:
         yield Left(tmp_path, stack)
 
 
-@pytest.mark.parametrize("access", ["RW", "RO"])
+@pytest.mark.parametrize("access", ["RW", "RO", "only while TriggerMode is On"])
 def test_the_bench_rests_until_a_delayed_exposure_has_ended(bench_camera: Left, access: str) -> None:
     old = "<Min>16</Min><Max>1000</Max></Float>"
     assert old in bench_camera.text
     bench_camera.text = bench_camera.text.replace(old, "<Min>16</Min><Max>1000000</Max></Float>")
     where, named = bench_camera.text.split('<FloatReg Name="TriggerDelayReg">')
+    if access.startswith("only"):
+        where = where.replace('e="TriggerDelay">', 'e="TriggerDelay"><pIsAvailable>TriggerModeReg</pIsAvailable>')
+        access = "RW"
     bench_camera.text = where + '<FloatReg Name="TriggerDelayReg">' + named.replace("RW", access, 1)
     simulated = bench_camera.play()
     with simulated._nodes.assuming("TriggerSelector", "FrameStart"):
@@ -74,6 +78,24 @@ def test_a_delay_that_is_wanted_is_waited_for(bench_camera: Left) -> None:
     np.testing.assert_array_equal(exposure.frame().pixels, SEEN)
 
 
+@pytest.mark.parametrize("raw", ["", "Raw"])
+def test_a_delay_under_a_name_of_the_maker_is_waited_for_or_refused(bench_camera: Left, raw: str) -> None:
+    name = f"FrameStartTriggerDelay{raw}"
+    bench_camera.text = bench_camera.text.replace('"AcquisitionStatus"', '"OtherStatus"')
+    bench_camera.add(name, f'<Integer Name="{name}">VALUE<Min>0</Min><Max>1000000</Max></Integer>')
+    simulated = bench_camera.play()
+    camera = bench_camera.open(features={name: 150_000})
+    if raw:
+        with pytest.raises(SettingRefused, match="a time by FrameStartTriggerDelayRaw: it counts in steps"):
+            camera.configure(LIGHT)
+        return
+    camera.configure(LIGHT)
+    exposure = camera.trigger()
+    exposure.wait_exposed()
+    assert time.monotonic() >= simulated.triggered_s + 0.155
+    np.testing.assert_array_equal(exposure.frame().pixels, SEEN)
+
+
 @pytest.mark.parametrize(
     ("name", "entries"),
     [
@@ -82,6 +104,10 @@ def test_a_delay_that_is_wanted_is_waited_for(bench_camera: Left) -> None:
         ("TestImageSelector", ("TestImage1", "Off")),
         ("SequencerMode", ("On", "Off")),
         ("EdgeFilter", ("Sharpen1", "Off")),
+        ("BSL_contrast_mode", ("SCurve", "linear")),
+        ("SequencerMode", ("SequencerOn", "SequencerOff")),
+        ("AutoExposure", ("On", "Off")),
+        ("LUTMode", ("Table", "Off")),
     ],
 )
 def test_a_mode_that_spoils_frames_is_off_or_the_capture_is_refused(
@@ -94,15 +120,52 @@ def test_a_mode_that_spoils_frames_is_off_or_the_capture_is_refused(
     for frame in camera.capture(3):
         np.testing.assert_array_equal(frame.pixels, SEEN)
     assert {info.exposure_s for info in bench_camera.infos} == {5e-3}
-    assert camera.node_map()[name] == "Off"
+    assert camera.node_map()[name] == entries[-1]
 
 
+@pytest.mark.parametrize("off", ["Off", "Sensor"])
 @pytest.mark.parametrize("name", ["BalanceWhiteAuto", "TestPattern", "SequencerMode"])
-def test_one_that_cannot_be_set_is_named(bench_camera: Left, name: str) -> None:
-    bench_camera.choice(name, "Other", "Off", access="RO")
+def test_one_that_cannot_be_set_is_named(bench_camera: Left, name: str, off: str) -> None:
+    bench_camera.choice(name, "Other", off, access="RO" if off == "Off" else "RW")
     bench_camera.play(**{name: "Other"})
-    with pytest.raises(SettingRefused, match=f"{name} is Other and could not be set to Off"):
+    reason = "could not be set to Off" if off == "Off" else "which of its values does nothing is not known"
+    with pytest.raises(SettingRefused, match=f"{name} is Other,? and {reason}"):
         bench_camera.open().configure(LIGHT)
+
+
+@pytest.mark.parametrize(("kind", "register", "low"), [("Integer", "IntReg", 0), ("Float", "FloatReg", 10)])
+def test_a_gamma_in_percent_is_refused(bench_camera: Left, kind: str, register: str, low: int) -> None:
+    node = f'<{kind} Name="Gamma">VALUE<Min>{low}</Min><Max>500</Max></{kind}>'
+    bench_camera.add("Gamma", node, kind=register, length=4 if kind == "Integer" else 8)
+    bench_camera.play(Gamma=45)
+    with pytest.raises(SettingRefused, match="Gamma is 45, and which of its values does nothing"):
+        bench_camera.open().configure(LIGHT)
+
+
+@pytest.mark.parametrize(("unit", "taken"), [("ticks", False), ("lines", False), ("microseconds", True)])
+def test_an_exposure_in_no_unit_of_time_is_refused(bench_camera: Left, unit: str, taken: bool) -> None:
+    old = "<pMax>ExposureMost</pMax><Unit>us</Unit>"
+    assert old in bench_camera.text
+    bench_camera.text = bench_camera.text.replace(old, f"<pMax>ExposureMost</pMax><Unit>{unit}</Unit>")
+    bench_camera.play()
+    if taken:
+        assert bench_camera.open().configure(LIGHT).exposure_s == 5e-3
+        return
+    with pytest.raises(SettingRefused, match=f"a time by ExposureTime: it counts in {unit}"):
+        bench_camera.open().configure(LIGHT)
+
+
+def test_the_first_region_is_the_image_and_the_others_are_off(bench_camera: Left) -> None:
+    bench_camera.choice("RegionSelector", "Region0", "Region1")
+    bench_camera.choice("RegionMode", "Off", "On", index='<pIndex Offset="8">RegionSelectorAt</pIndex>')
+    simulated = bench_camera.play(RegionMode="On", RegionSelector="Region1")
+    simulated.leave("RegionMode", "On")
+    camera = bench_camera.open()
+    camera.configure(LIGHT)
+    assert camera.node_map()["RegionSelector"] == "Region0"
+    assert camera.node_map()["RegionMode"] == "On"
+    simulated.leave("RegionSelector", "Region1")
+    assert camera.node_map()["RegionMode"] == "Off"
 
 
 def test_a_binning_by_words_is_undone(bench_camera: Left) -> None:
@@ -197,6 +260,23 @@ def test_a_feature_of_unknown_meaning_is_at_its_default_or_named(bench_camera: L
         (text,) = camera.warnings()
         assert "no default settings" in text
         assert "ShotMixing" in text
+
+
+def test_a_load_that_takes_its_time_is_waited_for(bench_camera: Left, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench_camera.choice("UserSetSelector", "Default")
+    bench_camera.add("UserSetLoad", '<Command Name="UserSetLoad">VALUE<CommandValue>1</CommandValue></Command>')
+    simulated = bench_camera.play()
+    memory = simulated._memory
+    monkeypatch.setattr(memory, "restore", lambda *args, **kept: load.append((args, kept)) or timer.start())
+    load: list[tuple[tuple[object, ...], dict[str, object]]] = []
+    restore = type(memory).restore
+    timer = threading.Timer(0.5, lambda: restore(memory, *load[0][0], **load[0][1]))  # type: ignore[arg-type]
+    camera = bench_camera.open()
+    camera.configure(LIGHT)
+    timer.join()
+    settings = camera.node_map()
+    assert (settings["PixelFormat"], settings["TriggerMode"], settings["ExposureTime"]) == ("Mono12p", "On", "5000")
+    assert camera.warnings() == []
 
 
 def test_a_load_that_changes_nothing_is_seen(bench_camera: Left) -> None:

@@ -36,6 +36,14 @@ def test_bytes_become_counts(name: str, memory: str, counts: list[int]) -> None:
     assert pixel_format(name).decode(data, len(counts), 1).tolist() == [counts]
 
 
+@pytest.mark.parametrize(("name", "fits"), [("Mono12", False), ("BayerGB10", False), ("Mono16", True)])
+def test_counts_that_the_camera_aligns_left_in_a_format_of_fewer_bits_are_told(name: str, fits: bool) -> None:
+    fmt = pixel_format(name)
+    memory = np.array([0xABC0, 0x1230], "<u2").view(np.uint8)
+    told = fmt.misalignment(memory, fmt.decode(memory, 2, 1), fmt.bits, 0)
+    assert told == ("" if fits else f"a count of 43968 needs more than {fmt.bits} bits")
+
+
 @given(
     fmt=st.sampled_from(PIXEL_FORMATS),
     width=st.integers(1, 9),
