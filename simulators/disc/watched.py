@@ -46,12 +46,12 @@ class DiscCalls:
         self._library = ctypes.CDLL(None)
         self._library.disc_calls_made.restype = ctypes.c_long
 
-    def arm(self, number: int, sent: signal.Signals = signal.SIGKILL, failing: int = 0) -> None:
-        """Count from zero, and send this process a signal before the call of that number; 0 for never.
+    def arm(self, number: int, failing: int = 0) -> None:
+        """Count from zero, and kill this process before the call of that number; 0 for never.
 
         The call of number `failing` fails with an input/output error, if it is one of a file that is open.
         """
-        self._library.disc_calls_arm(ctypes.c_long(number), ctypes.c_int(sent), ctypes.c_long(failing))
+        self._library.disc_calls_arm(ctypes.c_long(number), ctypes.c_int(signal.SIGKILL), ctypes.c_long(failing))
 
     def made(self) -> int:
         """Calls since `arm`."""

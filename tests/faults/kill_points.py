@@ -3,8 +3,6 @@
     python tests/faults/kill_points.py kill [EVERY [FIRST]]     each (or every n-th) call of a small campaign
     python tests/faults/kill_points.py error [EVERY [FIRST]]    each call fails with an input/output error instead
     python tests/faults/kill_points.py power [CUTS]             states of the disc after a power cut, replayed
-    python tests/faults/kill_points.py image [CUTS]             the same on copies of a block device (root, ext4)
-    python tests/faults/kill_points.py night [CAPTURES [CALLS]] a night, killed at random again and again
 
 After each kill the same command goes on. At its end every capture must be complete and equal to that of an undisturbed
 run in all but times and segments, and `acquire verify` must find nothing. Exit code 1 if anything is lost.
@@ -17,8 +15,6 @@ import hashlib
 import os
 import random
 import shutil
-import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -41,30 +37,23 @@ from simulators.disc.watched import RECORD, DiscCalls, build, restart_watched
 
 ROOT = Path(__file__).resolve().parents[2]
 WORK = Path(tempfile.gettempdir()) / f"umov_kill_points_{os.getuid()}"
-#: Longest time for the points of one run, seconds.
-LIMIT_S = float(os.environ.get("UMOV_LIMIT_S", "inf"))
-#: A night that was ended goes on, with other draws; its kills are counted anew.
-GO_ON = os.environ.get("UMOV_GO_ON", "")
-#: Runs of a night that may end by themselves before something is taken to be wrong.
-MOST_ENDED = 20
 #: Of prctl: processes whose parent has ended become children of this one.
 PR_SET_CHILD_SUBREAPER = 36
 #: What differs between two runs of one plan.
 TIMES = ("host_time_s", "camera_time_ns", "frame_id", "start_time", "closing/json", "segments/json", "segment", "crc32")
 
 
-def write_files(folder: Path, captures: int, states: int = 3) -> list[str]:
-    """Rig, plan and campaign of small captures; returns the options of `acquire`."""
+def write_files(folder: Path) -> list[str]:
+    """Rig, plan and campaign of a small capture; returns the options of `acquire`."""
     quick = {"rows": 16, "columns": 20, "clock_speed": 200, "camera_wait_s": 60}
     write_rig(folder / "rig.yaml", quick, settle_s=0.0)
     (folder / "plan.yaml").write_text(
         "kind: plan\nmode: stokes\nwavelength_nm: 662\nomega_deg: 35\nsample: {name: red_sphere}\n"
-        f"states: {{kind: fixed, states: {states}}}\nexposure_s: 0.001\ndarks: 1\n"
+        "states: {kind: fixed, states: 3}\nexposure_s: 0.001\ndarks: 1\n"
     )
-    angles = ", ".join(f"{20 + 100 * k / max(captures, 1):.3f}" for k in range(captures))
     (folder / "campaign.yaml").write_text(
         f"kind: campaign\nname: night\nplans: {{stokes: {folder / 'plan.yaml'}}}\nsamples: [{{name: red_sphere}}]\n"
-        f"wavelengths_nm: [662]\nomega_deg: [{angles}]\n"
+        f"wavelengths_nm: [662]\nomega_deg: [20]\n"
     )
     return ["--campaign", str(folder / "campaign.yaml"), "--rig", str(folder / "rig.yaml"), "--yes"]
 
@@ -144,9 +133,6 @@ def kill(options: list[str], stride: int, first: int, fails: bool) -> int:
     lost = points = 0
     begin_s = time.monotonic()
     for number in range(first, total + 1, stride):
-        if time.monotonic() - begin_s > LIMIT_S:
-            print(f"stopped before call {number}: no time left")
-            break
         out = captures / f"run{number}"
         at = {"number": 0, "failing": number} if fails else {"number": number}
         status, _ = run(options, out, lambda calls, at=at: calls.arm(**at))
@@ -163,70 +149,6 @@ def kill(options: list[str], stride: int, first: int, fails: bool) -> int:
     kind = "errors told" if fails else "kill points"
     print(f"{points} {kind} of {total} calls, {lost} with something lost, {time.monotonic() - begin_s:.0f} s")
     return lost
-
-
-def night(options: list[str], captures: int, calls: int, seed: int = 1) -> int:
-    """A campaign that is killed at random again and again until it is complete; in every tenth run a call fails first.
-
-    After `LIMIT_S` it is left alone to its end. Then every capture is compared with an undisturbed night's.
-    """
-    status, _ = run(options, WORK / "captures" / "whole", lambda armed: armed.arm(0))
-    assert status == 0, status
-    out, chance, record = WORK / "captures" / "night", random.Random(f"{seed}{GO_ON}"), _Known()
-    begin_s, kills, errors, ended, wrong = time.monotonic(), 0, 0, 0, list[str]()
-    while True:
-        number, failing = chance.randint(1, 2 * calls), 0
-        if number > 1 and chance.random() < 0.1:
-            failing = chance.randint(1, number - 1)
-        if time.monotonic() - begin_s > LIMIT_S:
-            number = failing = 0
-        status, _ = run(options, out, lambda armed, at=(number, failing): armed.arm(at[0], failing=at[1]))
-        wrong += record.lost(out / "night")
-        killed = os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
-        # Exit code 1 is a failure that was told: of a call that was to fail, or of a machine too busy for a device.
-        has_ended = not killed and os.waitstatus_to_exitcode(status) == 1
-        ended += has_ended and not failing
-        if not (killed or has_ended) or ended > MOST_ENDED:
-            break
-        kills, errors = kills + killed, errors + (failing > 0)
-        if kills % 50 == 0:
-            passed_s = time.monotonic() - begin_s
-            print(f"{kills} kills, {errors} failing calls, {record.states()} states, {passed_s:.0f} s", flush=True)
-    wrong += filter(None, [check(out, contents(WORK / "captures" / "whole"))])
-    complete = len(list((out / "night").glob("*.h5")))
-    code = os.waitstatus_to_exitcode(status)
-    print(
-        f"{kills} kills, {errors} failing calls, {ended} ended by themselves, last exit code {code}, {complete} of "
-        f"{captures} captures complete, {record.states()} states, {len(wrong)} findings, "
-        f"{time.monotonic() - begin_s:.0f} s"
-    )
-    print("\n".join(wrong[:10]))
-    return len(wrong) + (complete != captures)
-
-
-class _Known:
-    """The states of each capture that were there last time, so that none may go again."""
-
-    def __init__(self) -> None:
-        self._captures: dict[str, tuple[int, int]] = {}
-
-    def states(self) -> int:
-        return sum(done for _, done in self._captures.values())
-
-    def lost(self, folder: Path) -> list[str]:
-        """What is wrong with the captures that changed since the last look."""
-        wrong = []
-        for path in sorted(folder.glob("*")):
-            name = path.name.removesuffix(".partial")
-            changed, before = self._captures.get(name, (0, 0))
-            if not name.endswith(".h5") or path.stat().st_mtime_ns == changed:
-                continue
-            with Capture(path) as capture:
-                done, damaged = len(capture.done), capture.damaged_states()
-            if done < before or damaged:
-                wrong.append(f"{path.name}: {done} states of {before}, {damaged} damaged")
-            self._captures[name] = path.stat().st_mtime_ns, done
-        return wrong
 
 
 class _Reported:
@@ -305,67 +227,8 @@ def _left(folder: Path) -> tuple[int, str]:
     return states, unreadable
 
 
-def image(options: list[str], cuts: int, seed: int = 1) -> int:
-    """Stop at chosen calls, copy the block device as it is then, and look what the copy holds."""
-    device, mount = WORK / "device.img", WORK / "captures"
-    status, total = run(options, mount / "whole", lambda calls: calls.arm(0))
-    assert status == 0, status
-    chosen, lost, worst = random.Random(seed).sample(range(1, total + 1), min(cuts, total)), 0, 0
-    for number in sorted(chosen):
-        _fresh_device(device, mount)
-        log = WORK / "reported"
-        log.unlink(missing_ok=True)
-        child = os.fork()
-        if child == 0:
-            os.environ[RECORD] = str(log)
-            with open(os.devnull, "w") as null:
-                os.dup2(null.fileno(), 1)
-                os.dup2(null.fileno(), 2)
-            calls = DiscCalls()
-            _Reported(calls)
-            calls.arm(number, signal.SIGSTOP)
-            try:
-                acquire([*options, "--out", str(mount / "run")])
-            except SystemExit:
-                pass
-            finally:
-                os._exit(0)
-        _, status = os.waitpid(child, os.WUNTRACED)
-        shutil.copy(device, WORK / "copy.img")
-        # A run that makes a call less than the first one came to its end.
-        if os.WIFSTOPPED(status):
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            wait_for_orphans()
-        subprocess.run(["umount", mount], check=True)
-        copy = WORK / "copy"
-        copy.mkdir(exist_ok=True)
-        subprocess.run(["mount", "-o", "loop", WORK / "copy.img", copy], check=True)
-        try:
-            states_on_disc, unreadable = _left(copy / "run" / "night")
-        finally:
-            subprocess.run(["umount", copy], check=True)
-        reported = sum(call.kind == "note" for call in read_record(log)) if log.exists() else 0
-        worst = max(worst, reported - states_on_disc)
-        if reported - states_on_disc > 1 or unreadable:
-            lost += 1
-            print(f"cut at call {number}: {reported} reported, {states_on_disc} there; {unreadable}", flush=True)
-    print(f"{len(chosen)} copies of the block device: at most {worst} reported states lost, {lost} beyond the bound")
-    return lost
-
-
-def _fresh_device(device: Path, mount: Path) -> None:
-    shutil.rmtree(mount, ignore_errors=True)
-    mount.mkdir(parents=True)
-    device.unlink(missing_ok=True)
-    with device.open("wb") as file:
-        file.truncate(48 << 20)
-    subprocess.run(["mkfs.ext4", "-q", device], check=True)
-    subprocess.run(["mount", "-o", "loop", device, mount], check=True)
-
-
 def main() -> None:
-    """Run one of the five."""
+    """Run one of the three."""
     mode, numbers = sys.argv[1], [int(text) for text in sys.argv[2:]]
     if "LD_PRELOAD" not in os.environ:
         # Two at once would read each other's records. The lock goes on into the program that takes this one's place.
@@ -375,22 +238,17 @@ def main() -> None:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise SystemExit(f"another run uses {WORK}. Wait for its end.") from None
-        if not GO_ON:
-            shutil.rmtree(WORK, ignore_errors=True)
+        shutil.rmtree(WORK, ignore_errors=True)
         (WORK / "captures").mkdir(parents=True, exist_ok=True)
         restart_watched(build(WORK), WORK / "captures")
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)
-    captures = (numbers or [300])[0] if mode == "night" else 1
-    options = write_files(WORK, captures)
-    stride, first = [*numbers, *(1, 1)[len(numbers) :]][:2] if mode in ("kill", "error") else (1, 1)
-    work: dict[str, Callable[[], int]] = {
-        "kill": lambda: kill(options, stride, first, fails=False),
-        "error": lambda: kill(options, stride, first, fails=True),
-        "power": lambda: power(options, (numbers or [0])[0]),
-        "image": lambda: image(options, (numbers or [200])[0]),
-        "night": lambda: night(options, captures, numbers[1] if len(numbers) > 1 else 45),
-    }
-    sys.exit(1 if work[mode]() else 0)
+    options = write_files(WORK)
+    if mode == "power":
+        lost = power(options, (numbers or [0])[0])
+    else:
+        stride, first = [*numbers, *(1, 1)[len(numbers) :]][:2]
+        lost = kill(options, stride, first, fails=mode == "error")
+    sys.exit(1 if lost else 0)
 
 
 if __name__ == "__main__":

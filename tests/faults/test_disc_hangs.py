@@ -1,7 +1,6 @@
 """Promise 25: a disc that hangs holds a process of its own, and neither the light, nor Ctrl-C, nor the program's end.
 
-The disc process is stopped, which is what a hanging disc is for the process that measures; `safety_table.py`
-freezes a file system.
+The disc process is stopped, which is what a hanging disc is for the process that measures.
 """
 
 import contextlib
