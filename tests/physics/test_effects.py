@@ -6,18 +6,15 @@ import os
 import pkgutil
 import subprocess
 import sys
-from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import processing
-from processing.diagnosis.search.candidate import pool
 from processing.effect import BASE, EffectError, load_effects
 from processing.instrument.applied_effects import apply_to, changes_at, changes_of, instrument_effects
-from processing.instrument.changes import Changes, Conditions
+from processing.instrument.changes import Changes
 from processing.instrument.effects.base import InstrumentEffect
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
@@ -141,56 +138,6 @@ print(processing.__path__[0])
 print(*sorted(kinds))
 print(*sorted(reflectance_effects()))
 """
-
-
-@pytest.fixture
-def hidden(monkeypatch):
-    """Makes one module invisible to the search of the folders."""
-
-    def hide(folder: str, name: str) -> None:
-        iter_modules = pkgutil.iter_modules
-        path = importlib.import_module(folder).__path__
-
-        def without(where=None, prefix=""):
-            return (i for i in iter_modules(where, prefix) if not (i.name == name and list(where or ()) == list(path)))
-
-        monkeypatch.setattr(pkgutil, "iter_modules", without)
-        instrument_effects.cache_clear()
-        reflectance_effects.cache_clear()
-
-    yield hide
-    monkeypatch.undo()
-    instrument_effects.cache_clear()
-    reflectance_effects.cache_clear()
-
-
-def offered(configs: Path) -> set[str]:
-    """Kinds that `diagnose` offers for three instruments that have a place for every effect between them."""
-    kinds = set()
-    for file, nm in (("rgb950", 662), ("mosaic_polarimeter", 662), ("drr_imaging_630nm", 630)):
-        model = InstrumentModel.load(configs / f"instruments/{file}.yaml").at(nm)
-        model = model.model_copy(update={"calibrate": ()})
-        angles = np.random.default_rng(1).uniform(0, 360, 8)
-        conditions = Conditions.of(dict.fromkeys(model.axes, angles), tuple(c.name for c in model.channels))
-        # Two runs took the states.
-        kinds |= {c.kind for c in pool(model, [replace(conditions, run=np.arange(8) // 4)])}
-    return kinds | set(reflectance_effects())
-
-
-@cache
-def offered_by_all(configs: Path) -> set[str]:
-    return offered(configs)
-
-
-@pytest.mark.parametrize(("folder", "name"), FILES)
-def test_without_one_file_the_others_are_offered(folder, name, hidden, configs):
-    before = offered_by_all(configs)
-    effect = {**instrument_effects(), **reflectance_effects()}[name]
-    assert name in before or effect.from_file_only
-    hidden(folder, name)
-    # Two kinds are files of both folders.
-    twin = (FOLDERS[folder == FOLDERS[0]], name) in FILES and folder == FOLDERS[0]
-    assert offered(configs) == (before if twin else before - {name})
 
 
 def test_no_file_imports_an_effect():

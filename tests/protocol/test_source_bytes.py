@@ -251,13 +251,6 @@ def test_a_refusal_of_a_dc4100_is_explained_by_status_and_error() -> None:
         opened(path, lines).set_light(True)
 
 
-def test_status_bits_of_a_dc4100_are_those_of_the_manual() -> None:
-    # DC4100 manual rev. 2.2, page 28: bits 5, 7, 9, 11 no LED; bits 13, 15, 17, 19 LED open.
-    assert [dc4100.missing_led(channel) for channel in range(4)] == [0x20, 0x80, 0x200, 0x800]
-    assert [dc4100.open_led(channel) for channel in range(4)] == [0x2000, 0x8000, 0x20000, 0x80000]
-    assert (dc4100.SUPPLY_FAILS, dc4100.TOO_HOT) == (0x2, 0x8)
-
-
 # --- KURIOS -----
 
 
