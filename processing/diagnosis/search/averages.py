@@ -292,7 +292,7 @@ def _starts(sets: Sets, state: State) -> list[tuple[State, float]]:
     instead = (climb(sets, sets.without(state, int(k)), without=int(k)) for k in indices)
     several = (State(s.tau, state.unit) for s in instead)
     states = {s.tau.tobytes(): s for s in (state, *swap_groups(sets, state), *several)}.values()
-    score = np.array([sets.fitted(s).score for s in states])
+    score = np.array([sets.score(s) for s in states])
     share = np.exp(score - score.max())
     share /= share.sum()
     starts = [(s, float(w)) for s, w in zip(states, share, strict=True) if w > SHARES]

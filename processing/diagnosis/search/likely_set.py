@@ -28,14 +28,14 @@ def likely_set(sets: Sets, initial: BoolArray | None = None) -> State:
         begin = State(np.where(initial & sets.free, 1.0, sets.empty().tau), sets.noise.floor)
         retune(sets, begin)
         states.append(climb(sets, begin))
-    return max(states, key=lambda s: sets.fitted(s).score)
+    return max(states, key=lambda s: sets.score(s))
 
 
 def climb(sets: Sets, state: State, without: int | None = None) -> State:
     """The change of one group that gains most, as long as one gains; the unit follows. One group may stay away."""
     state = sets.settled(state.copy())
     away = np.arange(len(sets.groups)) == without
-    best, barred = sets.fitted(state).score, away.copy()
+    best, barred = sets.score(state), away.copy()
     for _ in range(STEPS):
         c = sets.conditional(state, follow=True)
         is_included = state.tau > 0
@@ -45,7 +45,7 @@ def climb(sets: Sets, state: State, without: int | None = None) -> State:
             break
         tried = state.copy()
         tried.tau[k] = 0.0 if is_included[k] else sets.taus[int(np.argmax(c.tau_weights[k]))]
-        now = sets.fitted(sets.settled(tried)).score
+        now = sets.score(sets.settled(tried))
         if now > best:
             state, best = tried, now
             barred = away.copy()

@@ -68,7 +68,7 @@ class Posterior:
     @property
     def score(self) -> float:
         """Log probability of the likeliest set, a constant left out."""
-        return self.sets.fitted(self.samples.best).score
+        return self.sets.score(self.samples.best)
 
     @property
     def any_cause(self) -> bool:
@@ -124,7 +124,7 @@ class _Round:
 
     @property
     def score(self) -> float:
-        return self.sets.fitted(self.state).score
+        return self.sets.score(self.state)
 
 
 #: Linearizes about values (K,), and finds a set from some groups (G,) on too; None where the model has no intensities.

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dlauum, dtrtri
 from scipy.special import betaln
 
 from processing.arrays import Array
@@ -227,29 +228,33 @@ class Sets:
         """Posterior of the parameters that are there."""
         return self._solved(state)[0]
 
+    def score(self, state: State) -> float:
+        """Log probability of a set."""
+        return self._factored(state)[-1]
+
     def _excess(self, state: State) -> float:
         """Excess that a set leaves, what the prior takes included."""
-        active, _, lower = self._factored(state)
-        right = solve_triangular(lower, self.form.gradient[active], lower=True) if active.size else np.zeros(0)
-        return self.form.excess - float(right @ right) / state.unit
+        return self._factored(state)[-2]
 
-    def _factored(self, state: State) -> tuple[NDArray[np.int64], Array, Array]:
-        """Parameters (A,) that are there, curvature (A,) of their prior, and the root (A, A) of the posterior one."""
-        on = np.flatnonzero(state.tau > 0)
+    def _factored(self, state: State) -> tuple[NDArray[np.int64], Array, Array, float, float]:
+        """Parameters (A,) of a set, root (A, A) of their posterior curvature, that into the gradient, excess, score."""
+        on, u = np.flatnonzero(state.tau > 0), state.unit
         active = np.concatenate([np.zeros(0, dtype=np.int64), *(self.groups[i].index for i in on)])
         prior = np.concatenate([np.zeros(0), *(np.full(self.groups[i].index.size, state.tau[i] ** -2.0) for i in on)])
-        return active, prior, _root(self.form.curvature[np.ix_(active, active)] / state.unit + np.diag(prior))
-
-    def _solved(self, state: State) -> tuple[SetFit, Array, Array]:
-        u, tau = state.unit, state.tau
-        active, prior, lower = self._factored(state)
-        inverse = solve_triangular(lower, np.eye(active.size), lower=True) if active.size else lower
-        right = inverse @ self.form.gradient[active] / u
+        lower = _root(self.form.curvature[np.ix_(active, active)] / u + np.diag(prior))
+        right = solve_triangular(lower, self.form.gradient[active] / u, lower=True) if active.size else np.zeros(0)
         excess = self.form.excess - u * float(right @ right)
         # What the width of the prior costs: log det (I + T H / u).
         width = 2 * float(np.log(np.diag(lower)).sum()) - float(np.log(prior).sum())
-        score = self.noise.log_likelihood(excess) - 0.5 * width + self._log_prior(tau)
-        return SetFit(active, -inverse.T @ right, inverse.T @ inverse, excess, score), inverse, right
+        score = self.noise.log_likelihood(excess) - 0.5 * width + self._log_prior(state.tau)
+        return active, lower, right, excess, score
+
+    def _solved(self, state: State) -> tuple[SetFit, Array, Array]:
+        active, lower, right, excess, score = self._factored(state)
+        inverse = np.asarray(dtrtri(lower, lower=1)[0]) if active.size else lower
+        half = np.tril(dlauum(inverse, lower=1)[0]) if active.size else lower
+        covariance = half + np.tril(half, -1).T
+        return SetFit(active, -inverse.T @ right, covariance, excess, score), inverse, right
 
     def conditional(self, state: State, *, follow: bool = False) -> Conditional:
         """Posterior of the parameters that are there, and odds of every group given the others.
@@ -287,21 +292,21 @@ class Sets:
         self, state: State, fit: SetFit, inverse: Array, right: Array
     ) -> Iterator[tuple[NDArray[np.int64], Array, Array]]:
         """Groups of one size, with curvature (G, n, n) and gradient (G, n) about zero given all other groups."""
-        u = state.unit
-        cross = self.form.curvature[fit.active].T @ (inverse.T / u)
-        gradient = self.form.gradient / u - cross @ right
         where = np.full(self.size, -1)
         where[fit.active] = np.arange(fit.active.size)
         for members, index, own_curvature in self._alike:
-            part = cross[index]
-            s = own_curvature / u - part @ part.transpose(0, 2, 1)
-            q = gradient[index]
-            for k in np.flatnonzero(state.tau[members] > 0):
-                at = where[index[k]]
-                # The posterior of a group that is there is its prior times what the others leave it.
-                precision = np.linalg.inv(fit.covariance[np.ix_(at, at)])
-                s[k] = precision - np.eye(at.size) * state.tau[members[k]] ** -2.0
-                q[k] = -precision @ fit.mean[at]
+            s, q = own_curvature / state.unit, self.form.gradient[index] / state.unit
+            is_included = state.tau[members] > 0
+            others = index[~is_included]
+            across = self.form.curvature[np.ix_(others.ravel(), fit.active)] @ (inverse.T / state.unit)
+            part = across.reshape(*others.shape, fit.active.size)
+            s[~is_included] -= part @ part.transpose(0, 2, 1)
+            q[~is_included] -= part @ right
+            # The posterior of a group that is there is its prior times what the others leave it.
+            at = where[index[is_included]]
+            precision = np.linalg.inv(fit.covariance[at[:, :, None], at[:, None, :]])
+            s[is_included] = precision - np.eye(at.shape[1]) * state.tau[members[is_included], None, None] ** -2.0
+            q[is_included] = -(precision @ fit.mean[at][..., None])[..., 0]
             yield members, s, q
 
 

@@ -70,25 +70,25 @@ class Acting:
     ----------
     space : candidates as they are at the capture's wavelength.
     index : (J,) positions in the common vector.
-    mix : (own values, J), which makes the values of `space` of those; None: they are the same.
+    own, weight : (J,) the value of `space` that each of them adds to, and its factor there.
     """
 
     space: Space
     index: NDArray[np.int64]
-    mix: Array | None
+    own: NDArray[np.int64]
+    weight: Array
 
     def of(self, values: Array) -> Array:
         """Values of `space`, of the common vector."""
-        subset = values[self.index]
-        return subset if self.mix is None else self.mix @ subset
+        return np.asarray(np.bincount(self.own, self.weight * values[self.index], self.space.size), dtype=float)
 
     def spread(self, slopes: Array) -> Array:
         """Derivatives (..., J) by the common values, of those (..., own values)."""
-        return slopes if self.mix is None else slopes @ self.mix
+        return np.asarray(slopes[..., self.own] * self.weight)
 
     def spread_products(self, products: Array) -> Array:
         """The same of products (..., own values, own values)."""
-        return products if self.mix is None else np.asarray(self.mix.T @ products @ self.mix)
+        return self.spread(self.spread(products.swapaxes(-1, -2)).swapaxes(-1, -2))
 
 
 @dataclass
@@ -124,10 +124,9 @@ class Space:
         chosen = [k for k, c in enumerate(self.candidates) if c.acts(capture, wavelength_nm)]
         index = [np.zeros(0, dtype=np.int64), *(np.r_[self.slices[k]] for k in chosen)]
         subspace = Space(tuple(self.candidates[k].at(wavelength_nm) for k in chosen))
-        mix = None
-        if any(self.candidates[k].curve is not None for k in chosen):
-            mix = block_diag(*(self.candidates[k].matrix(wavelength_nm) for k in chosen))
-        return Acting(subspace, np.concatenate(index).astype(np.int64), mix)
+        # Of a curve each coefficient adds to one value.
+        mix = block_diag(*(self.candidates[k].matrix(wavelength_nm) for k in chosen))
+        return Acting(subspace, np.concatenate(index).astype(np.int64), np.abs(mix).argmax(axis=0), mix.sum(axis=0))
 
     @property
     def pairs(self) -> list[tuple[Candidate, slice]]:
