@@ -33,7 +33,10 @@ def held_out_check(solved: Solution, stretch: float = 1.0) -> Check:
 
 def rows_checks(name: str, before: Array, after: Array) -> tuple[Check, Check]:
     """Rank and condition of a measurement matrix W (L, 16) without and with a correction."""
-    (rank, condition), (new_rank, new_condition) = (_rank_and_condition(w) for w in (before, after))
+    sizes = [np.linalg.svd(w, compute_uv=False) for w in (before, after)]
+    rank, new_rank = (int(np.sum(size > MEASURED * size[0])) for size in sizes)
+    # A direction that the correction adds may be seen poorly: it was not seen at all before.
+    condition, new_condition = (float(size[0] / max(size[rank - 1], 1e-300)) for size in sizes)
     where = f"of the measurement matrix of {name}"
     return (
         Check(name=f"rank {where}", before=rank, after=new_rank, holds=new_rank >= rank),
@@ -44,12 +47,6 @@ def rows_checks(name: str, before: Array, after: Array) -> tuple[Check, Check]:
             holds=bool(new_condition <= WORSE_CONDITION * condition),
         ),
     )
-
-
-def _rank_and_condition(w: Array) -> tuple[int, float]:
-    size = np.linalg.svd(w, compute_uv=False)
-    size = size[size > MEASURED * size[0]]
-    return size.size, float(size[0] / size[-1])
 
 
 @dataclass(frozen=True)
