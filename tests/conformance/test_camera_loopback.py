@@ -142,29 +142,6 @@ def test_a_full_sensor_comes_through_exactly(loopback: Loopback) -> None:
     assert camera.full_scale == 4095
 
 
-@pytest.mark.parametrize(
-    ("name", "bits", "polarized"),
-    [
-        ("Mono8", 8, False),
-        ("Mono10p", 10, False),
-        ("Mono12", 12, False),
-        ("Mono12Packed", 12, False),
-        ("PolarizeMono8", 8, True),
-        ("PolarizedMono12p", 12, True),
-        ("PolarizedMono12Packed", 12, True),
-    ],
-)
-def test_every_format_gives_right_aligned_counts(loopback: Loopback, name: str, bits: int, polarized: bool) -> None:
-    _, camera = loopback(config=aravis.Config(device="127.0.0.1"))
-    camera.configure(CameraSettings(exposure_s=1e-4, pixel_format=name))
-    frame = camera.capture()[0]
-    expected = ((np.arange(64 * 48) * 7 + frame.frame_id) % 4096).reshape(48, 64) >> (12 - bits)
-    assert np.array_equal(frame.pixels, expected)
-    identity = camera.describe()
-    assert (camera.bits, identity.bits, identity.pixel_format, identity.polarized) == (bits, bits, name, polarized)
-    assert identity.pixel_format_code >> 16 & 0xFF in (8, 10, 12, 16)
-
-
 def test_left_aligned_counts_are_shifted_and_a_wrong_shift_is_noticed(loopback: Loopback) -> None:
     def left_aligned(info: ExposureInfo) -> NDArray[np.uint16]:
         return counting(info) << np.uint16(4)

@@ -1,6 +1,5 @@
 """`diagnose` on real measurements: nothing is set for a data set beyond its train in YAML."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +10,7 @@ import pytest
 from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.instrument_file import extend_model
-from processing.diagnosis.search.fit import minimize, prior
-from processing.diagnosis.search.result import Check
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 from processing.public_data.conversion import PublicStates, mirror_means, single_detector, tables_of
@@ -97,87 +93,6 @@ def test_the_telescope_at_one_wavelength(public_files, configs, tmp_path):
     # is used is another question: one wavelength tells so little of M that it gets worse by a chance of 0.6 to 4 %.
     residual = next(check.after for check in d.correction.checks if check.name.startswith("rms on held-out data"))
     assert 0.05 < residual < 0.25
-
-
-def held_out_of_each(public_files, configs: Path, tmp_path: Path, wavelengths: tuple[int, ...] | None) -> list[Check]:
-    """What a joint fit leaves at each wavelength of states that it did not see."""
-    instrument = configs / "instruments/dual_beam_charis.yaml"
-    paths = telescope(public_files, tmp_path, instrument)
-    chosen = [paths[nm] for nm in wavelengths or paths]
-    d = diagnose_captures(chosen, InstrumentModel.load(instrument))[0].diagnosis
-    assert d.correction.refused is None
-    assert "angle_per_state" in {e.kind for e in d.effects}
-    return [c for c in d.correction.checks if c.name.startswith("rms on held-out data of")]
-
-
-@pytest.mark.skipif("UMOV_SLOW" not in os.environ, reason="ten wavelengths of one sample are quicker: UMOV_SLOW=1")
-def test_four_wavelengths_of_the_telescope_share_the_angles_of_their_states(public_files, configs, tmp_path):
-    checks = held_out_of_each(public_files, configs, tmp_path, (1575, 1744, 1932, 2139))
-    assert len(checks) == 4
-    assert all(0.01 < c.after < 0.2 < c.before for c in checks)
-
-
-@pytest.mark.skipif("UMOV_SLOW" not in os.environ, reason="takes six minutes: UMOV_SLOW=1")
-@pytest.mark.timeout(1800)
-def test_all_wavelengths_of_the_telescope(public_files, configs, tmp_path):
-    checks = held_out_of_each(public_files, configs, tmp_path, None)
-    assert len(checks) == 22
-    assert sum(c.after <= 0.25 for c in checks) >= 18
-
-
-@pytest.mark.skipif("UMOV_SLOW" not in os.environ, reason="takes three minutes: UMOV_SLOW=1")
-@pytest.mark.timeout(1800)
-def test_terms_of_even_wavelengths_predict_whole_states_of_odd_ones(public_files, configs, tmp_path):
-    """Terms and their sizes are of the even wavelengths; their values are fitted to four fifths of the odd states."""
-    instrument = configs / "instruments/dual_beam_charis.yaml"
-    model = InstrumentModel.load(instrument)
-    paths = [path for _, path in sorted(telescope(public_files, tmp_path, instrument).items())]
-    found = diagnose_captures(paths[::2], model)[0].solution
-    known: dict[tuple[str, str], list[np.ndarray]] = {}
-    for c, part in found.space.pairs:
-        known.setdefault((c.kind, c.place), []).append(
-            found.fit.values[part] if c.effect.per_state else found.weak[part] * c.typical**2
-        )
-    models, data = [], []
-    for path in paths[1::2]:
-        with Capture(path) as capture:
-            models.append(model.nominal_at(capture.header.wavelength_nm))
-            data.append(read_capture(capture, models[-1]))
-    bench = WholeBench(InstrumentProblem(models, data), print)
-    # As the moments of the captures are divided.
-    fold = np.random.default_rng(0).permutation(data[0].conditions.states) % bench.problem.folds
-
-    def left_over(with_angles: bool) -> float:
-        """Rms of (left - right) / (left + right) in states that no fit saw, percent, mean over the wavelengths."""
-        terms = [
-            c
-            for c in bench.pool
-            if (c.kind, c.place) in known and (with_angles or not c.effect.per_state) and not c.effect.is_nominal
-        ]
-        space = Space((*bench.base.candidates, *terms))
-        start, weak, free = np.zeros(space.size), prior(space), np.ones(space.size, dtype=bool)
-        for c, part in space.pairs:
-            if c in bench.base.candidates:
-                start[part] = bench.start[c]
-            elif c.effect.per_state:
-                # One exposure holds all wavelengths: the angles are those that the even ones found.
-                (start[part],), free[part] = known[c.kind, c.place], False
-            elif known[c.kind, c.place][0].size == c.size:
-                weak[part] = np.mean(known[c.kind, c.place], axis=0) / c.typical**2
-        start = minimize(bench.problem, space, start, weak=weak, free=free).values
-        error = np.zeros((len(data), fold.size))
-        for f in range(bench.problem.folds):
-            others = [g for g in range(bench.problem.folds) if g != f]
-            values = minimize(bench.problem, space, start, others, weak=weak, free=free).values
-            for k, capture in enumerate(bench.problem.captures):
-                told = (bench.problem.rows(k, space, values) @ capture.sample).reshape(-1, 2)
-                seen = capture.signal.reshape(-1, 2)
-                ratio = [(i[:, 0] - i[:, 1]) / i.sum(axis=1) for i in (seen, told)]
-                error[k, fold == f] = (ratio[0] - ratio[1])[fold == f]
-        return float(100 * np.sqrt((error**2).mean(axis=1)).mean())
-
-    assert 0.1 < left_over(with_angles=False) < 0.26
-    assert 0.1 < left_over(with_angles=True) < 0.215
 
 
 def one_detector(public_files, folder: Path, instrument: Path, wavelength_nm: int, beside: int) -> Path:
