@@ -5,14 +5,12 @@ environment takes every table.
 """
 
 import os
-from pathlib import Path
 
 import pytest
 
-from simulators.camera.gige_camera import GigeCamera
 from simulators.camera.node_map import node_map, node_maps
 from simulators.conformance import CameraConformance
-from simulators.conformance.camera import CameraTwin, GigeTwin, Show, pixel_source
+from simulators.conformance.camera import CameraTwin, GigeTwin, Show
 
 ONE_OF_EACH = ["lucid_tri050s_p", "flir_bfs_pge_51s5p", "basler_aca2440_20gm"]
 TABLES = [name for name in node_maps() if name != "loopback"] if os.environ.get("UMOV_EVERY_TABLE") else ONE_OF_EACH
@@ -41,22 +39,3 @@ class TestAravisOnTablesOfMakers(CameraConformance):
 
     def make_twin(self, show: Show) -> CameraTwin:
         return GigeTwin(show, self._table)
-
-
-STYLE = Path(__file__).parent / "descriptions" / "in_the_style_of_makers.xml"
-
-
-class DescribedTwin(GigeTwin):
-    """A GigE Vision camera with a description in the style of makers."""
-
-    def __init__(self, show: Show) -> None:
-        super().__init__(show)
-        self.entry |= {"settings": {"pixel_format": "Mono12p"}}
-        self._camera = GigeCamera("TWIN-1", *self.size, pixel_source(show), description=STYLE, bits=self.bits)
-
-
-class TestAravisOnADescription(CameraConformance):
-    kind = "aravis"
-
-    def make_twin(self, show: Show) -> CameraTwin:
-        return DescribedTwin(show)

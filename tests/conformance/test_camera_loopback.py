@@ -55,23 +55,6 @@ def loopback() -> Iterator[Loopback]:
         yield make
 
 
-def test_settings_are_read_back(loopback: Loopback) -> None:
-    _, camera = loopback()
-    region = {"width": 32, "height": 20, "offset_x": 8, "offset_y": 4}
-    back = camera.configure(CameraSettings(exposure_s=0.0123, pixel_format="Mono16", trigger="software", **region))
-    assert back.exposure_s == pytest.approx(0.0123, abs=1e-6)
-    assert (back.width, back.height, back.offset_x, back.offset_y) == (32, 20, 8, 4)
-    assert (back.pixel_format, back.trigger, back.packet_size, back.frame_average) == ("Mono16", "software", 9000, 1)
-    assert camera.settings == back
-    assert camera.capture(1)[0].pixels.shape == (20, 32)
-    # No region asked for is the full sensor again, and a setting left open stays.
-    back = camera.configure(CameraSettings(gain_db=6.5))
-    assert (back.width, back.height, back.offset_x) == (64, 48, 0)
-    assert back.exposure_s == pytest.approx(0.0123, abs=1e-6)
-    assert back.gain_db == 6.5
-    assert camera.temperature_c() == 38.5
-
-
 def test_what_makes_counts_non_linear_is_switched_off(loopback: Loopback) -> None:
     simulated, camera = loopback()
     assert simulated.value("GammaEnable") == 1
@@ -197,17 +180,6 @@ def test_a_hardware_trigger_starts_the_armed_camera(loopback: Loopback) -> None:
     assert camera.statistics().stale_discarded == 0
 
 
-def test_describe_names_camera_and_link(loopback: Loopback) -> None:
-    _, camera = loopback()
-    camera.configure(DARK)
-    identity = camera.describe()
-    assert identity.serial_number == "LOOP1"
-    assert (identity.address, identity.interface) == ("127.0.0.1", "lo")
-    assert identity.interface_mtu is not None
-    assert identity.packet_size == 9000
-    assert (identity.sensor_width, identity.sensor_height) == (64, 48)
-
-
 @pytest.mark.parametrize("device", ["LOOP1", None])
 def test_a_camera_is_found_by_serial_number_or_alone(loopback: Loopback, device: str | None) -> None:
     _, camera = loopback(config=aravis.Config(device=device))
@@ -274,13 +246,6 @@ def test_decimation_and_mirrors_are_set_and_read_back(loopback: Loopback) -> Non
     back = camera.configure(CameraSettings(decimation=1))
     assert (back.decimation, back.reverse_x) == (1, False)
     assert simulated.value("ReverseX") == 0
-
-
-def test_a_trigger_is_sent_when_the_camera_is_armed(loopback: Loopback) -> None:
-    simulated, camera = loopback(arming_s=0.15)
-    camera.configure(DARK)
-    camera.capture(5)
-    assert simulated.ignored_triggers == 0
 
 
 def test_a_camera_that_is_never_armed_says_so(loopback: Loopback, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.aravis_library import list_cameras, load_aravis
 from drivers.camera import CameraSettings
 from drivers.cameras import aravis
 from processing.yaml_file import ConfigError
@@ -81,15 +80,6 @@ def test_the_limits_that_a_camera_keeps_in_registers_follow_the_region(stack: Ex
         camera.configure(CameraSettings(width=40, offset_x=26))
 
 
-def test_the_time_behind_the_image_is_that_of_the_exposure(stack: ExitStack) -> None:
-    played(stack)
-    camera = opened(stack)
-    camera.configure(CameraSettings(exposure_s=0.02))
-    assert camera.node_map()["ChunkModeActive"] == "true"
-    times_s = np.array([frame.camera_time_ns for frame in camera.capture(3)]) * 1e-9
-    assert np.all(np.diff(times_s) >= 0.02)
-
-
 @pytest.mark.parametrize("behind", ["StatusBit", "StatusReg"])
 def test_the_status_of_the_exposure_is_told(stack: ExitStack, tmp_path: Path, behind: str) -> None:
     # A bit of many that a formula takes out, or a register in which each selected status appears.
@@ -134,12 +124,6 @@ def test_a_pulse_on_the_line_exposes_and_a_program_s_trigger_does_not(stack: Exi
     simulated.fire()
     camera.capture()
     assert len(shown.infos) == 2
-
-
-def test_a_camera_is_found_by_asking_everybody(stack: ExitStack) -> None:
-    played(stack)
-    aravis_module, _ = load_aravis()
-    assert "PLAYED1" in [camera["serial_number"] for camera in list_cameras(aravis_module)]
 
 
 def test_a_description_is_served_as_it_is_packed_or_not(stack: ExitStack, tmp_path: Path) -> None:

@@ -95,15 +95,6 @@ def test_elliptec() -> None:
     assert talk(line, b"5gs") == b"5GS00\r\n"
 
 
-def test_elliptec_modules_move_at_once_and_answer_when_they_end() -> None:
-    line, clock = emulator("elliptec", homed=True)
-    assert talk(line, b"0ma00023000" + b"1ma00008C00") == b""
-    clock.sleep_s(0.7)
-    assert line.take_output() == b"1PO00008C00\r\n"
-    assert talk(line, b"1gp0gs") == b"1PO00008C00\r\n0GS09\r\n"
-    assert run_out(line, clock) == b"0PO00023000\r\n"
-
-
 def test_smc100() -> None:
     line, clock = emulator("smc100")
     assert talk(line, b"1VE\r\n") == b"1VE SMC100CC 2.0.1\r\n"
@@ -133,16 +124,6 @@ def test_smc100() -> None:
     assert talk(line, b"1RS\r\n1TS\r\n") == b""
     clock.sleep_s(1.0)
     assert talk(line, b"1TS\r\n") == b"1TS00000A\r\n"
-
-
-def test_smc100_stop_without_an_address_stops_all() -> None:
-    line, clock = emulator("smc100", homed=True, axes=2)
-    talk(line, b"1PA170\r\n2PA170\r\n")
-    clock.sleep_s(0.2)
-    talk(line, b"ST\r\n")
-    run_out(line, clock)
-    assert 0 < line.true_deg(0) < 100
-    assert line.true_deg(1) == pytest.approx(line.true_deg(0))
 
 
 def h(text: str) -> bytes:
@@ -183,38 +164,6 @@ def test_apt_stepper() -> None:
     assert talk(unit, h("11 02 01 00 50 01")) == h("12 02 01 02 01 50")
     talk(unit, h("48 04 06 00 d0 01 01 00 00 00 01 00"))
     assert run_out(unit, clock) == b""
-
-
-def test_apt_dc_servo_and_its_periodic_status() -> None:
-    unit, clock = emulator("apt-kdc101", homed=True)
-    info = talk(unit, h("05 00 00 00 50 01"))
-    assert int.from_bytes(info[6:10], "little") == 27_000_001
-    assert info[6 + 76] == 6
-    assert talk(unit, h("90 04 01 00 50 01"))[:6] == h("91 04 0e 00 81 50")
-    assert talk(unit, h("14 04 01 00 50 01"))[:8] == h("15 04 0e 00 81 50 01 00")
-    talk(unit, h("11 00 00 00 50 01"))
-    clock.sleep_s(0.15)
-    assert unit.take_output()[:2] == h("91 04")
-    talk(unit, h("12 00 00 00 50 01"))
-    clock.sleep_s(1.0)
-    assert unit.take_output() == b""
-
-
-def test_apt_rack_and_its_bays() -> None:
-    rack, clock = emulator("apt-bsc203", axes=2)
-    info = talk(rack, h("05 00 00 00 11 01"))
-    assert info[:6] == h("06 00 54 00 81 11")
-    assert info[10:18] == b"BSC203\0\0"
-    # The bays from 0 on: occupied, occupied, empty.
-    for bay, state in ((0, 1), (1, 1), (2, 2)):
-        assert talk(rack, bytes((0x60, 0, bay, 0, 0x11, 1))) == bytes((0x61, 0, bay, state, 1, 0x11))
-    assert talk(rack, h("11 04 01 00 23 01")) == b""
-    assert talk(rack, h("43 04 01 00 22 01")) == b""
-    assert run_out(rack, clock) == h("44 04 01 00 01 22")
-    talk(rack, h("53 04 06 00 a2 01 01 00 00 08 00 00"))
-    assert run_out(rack, clock)[:6] == h("64 04 0e 00 81 22")
-    assert talk(rack, h("11 04 01 00 22 01")) == h("12 04 06 00 81 22 01 00 00 08 00 00")
-    assert talk(rack, h("11 04 01 00 21 01")) == h("12 04 06 00 81 21 01 00 00 00 00 00")
 
 
 def test_a_k10cr2_sends_a_longer_status_and_a_malformed_address() -> None:
@@ -343,33 +292,3 @@ def test_a_gsc_02_is_silent_and_must_be_told_the_way_home() -> None:
     assert talk(box, b"M:W+P400-P800\r\nG\r\n") == b""
     clock.sleep_s(60.0)
     assert talk(box, b"Q:\r\n") == b"       400,-      800,K,K,R\r\n"
-
-
-def test_a_conex_agp_knows_no_speed() -> None:
-    box, _ = emulator("conex-agp")
-    assert talk(box, b"1VE\r\n").startswith(b"1VE CONEX-AGP")
-    assert talk(box, b"1VA?\r\n1TE\r\n") == b"1TED\r\n"
-
-
-QUESTIONS = {
-    "gsc-01": b"Q:\r\n",
-    "zaber": b"/1 1 07 get limit.max\n",
-    "elliptec": b"1gp",
-    "smc100": b"1TS\r\n",
-    "esp301": b"VE?\r",
-    "gcs2": b"*IDN?\n",
-    "standa": b"gser",
-    "apt-k10cr1": bytes.fromhex("110401005001"),
-    "apt-kdc101": bytes.fromhex("900401005001"),
-    "apt-bbd203": bytes.fromhex("900401002101"),
-    "apt-kbd101": bytes.fromhex("900401005001"),
-}
-
-
-@pytest.mark.parametrize("kind", QUESTIONS)
-def test_input_in_single_bytes_gives_the_same_answers(kind: str) -> None:
-    lines, _ = emulator(kind)
-    pieces, _ = emulator(kind)
-    for byte in QUESTIONS[kind]:
-        pieces.receive(bytes([byte]))
-    assert pieces.take_output() == talk(lines, QUESTIONS[kind]) != b""

@@ -20,7 +20,6 @@ from simulators.controllers.fw102c import FW102CEmulator
 from simulators.controllers.i7000 import I7060Emulator
 from simulators.controllers.kurios import KuriosEmulator
 from simulators.controllers.sc10 import SC10Emulator
-from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
 from simulators.serial.reply_faults import Fault
 from tests.protocol.scripted import scripted, served
@@ -140,12 +139,6 @@ def test_what_a_cornerstone_cannot_do_is_refused_by_name() -> None:
             source.set_light(False)
 
 
-def test_an_instrument_that_is_no_cornerstone_is_named() -> None:
-    named = pytest.raises(WrongDevice, match="'Lamp 3000' is no Cornerstone")
-    with scripted((b"INFO?\r\n", b"Lamp 3000\r\n")) as (path, lines), named:
-        cornerstone.open(cornerstone.Config(port=path, range_nm=(350, 1000)), lines)
-
-
 # --- DC2200 -----
 
 
@@ -243,14 +236,6 @@ def test_each_call_of_a_dc4100_sends_these_lines_and_no_others(action, pairs) ->
         action(opened(path, lines))
 
 
-def test_a_refusal_of_a_dc4100_is_explained_by_status_and_error() -> None:
-    # Status 0xA88: too hot.
-    pairs = [*LED_OFF, ("O 0 1", ""), *LED_OFF, *[("R?", "2696")] * 2, ("E?", "ERROR 4:over temperature")]
-    refusal = pytest.raises(CommandRejected, match=r"LED 1 on: .*too hot.*error 4 over temperature")
-    with scripted(*dc4100_wire(pairs)) as (path, lines), refusal:
-        opened(path, lines).set_light(True)
-
-
 # --- KURIOS -----
 
 
@@ -303,28 +288,6 @@ def test_a_kurios_is_not_used_while_it_warms_up() -> None:
 # --- FW102C, and one place for each wavelength -----
 
 POSITIONS = {451.0: 1, 662.0: 3}
-
-
-class OtherLineEnds:
-    """An emulator behind a terminal server that changes CR."""
-
-    def __init__(self, emulator: Emulator, line_end: bytes) -> None:
-        self._emulator, self._line_end = emulator, line_end
-        self.receive, self.next_output_s = emulator.receive, emulator.next_output_s
-
-    def take_output(self) -> bytes:
-        return self._emulator.take_output().replace(b"\r", self._line_end)
-
-
-@pytest.mark.parametrize("line_end", [b"\n", b"\r\n", b"\n\r"])
-def test_lines_that_end_otherwise(line_end: bytes) -> None:
-    emulator = FW102CEmulator(FastClock(100.0, base=patient_clock()))
-    with served(OtherLineEnds(emulator, line_end)) as (path, lines):
-        source = fw102c.open(fw102c.Config(port=path, positions=POSITIONS, dark_position=6), lines)
-        source.select(662.0)
-        source.set_light(True)
-        assert source.is_on()
-        assert emulator.light_at(662.0) == 1.0
 
 
 def test_the_filter_of_the_wavelength_stands_in_the_beam() -> None:
