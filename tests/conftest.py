@@ -186,19 +186,21 @@ def run_main(capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str,
 
 
 @pytest.fixture
-def acquire(run_main: Callable[..., tuple[int, str, str]]) -> Callable[..., tuple[int, str, str]]:
+def acquire(run_main: Callable[..., tuple[int, str, str]]) -> Any:
     """Runs `acquire`, as `run_main` does; a thread of it may fail with a traceback."""
     from acquisition.commands.application import main
+    from tests.commands import Program
 
-    return partial(run_main, main, traceback=True)
+    return Program(partial(run_main, main, traceback=True))
 
 
 @pytest.fixture
-def process(run_main: Callable[..., tuple[int, str, str]]) -> Callable[..., tuple[int, str, str]]:
+def process(run_main: Callable[..., tuple[int, str, str]]) -> Any:
     """Runs `process`, as `run_main` does."""
     from processing.commands.application import main
+    from tests.commands import Program
 
-    return partial(run_main, main)
+    return Program(partial(run_main, main))
 
 
 @pytest.fixture(scope="session")

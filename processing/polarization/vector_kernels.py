@@ -10,13 +10,10 @@ from processing.computing.compiling import compiled, in_parts
 
 #: Of the 68 and 95 % interval.
 DEVIATES = (1.0, 1.959964)
-#: Error of a short length at least, in units of the noise: an observed one far below what noise alone makes allows
-#: hardly any length.
+#: Least error of a short length, in units of the noise: a far smaller observed one allows hardly any length.
 LEAST = 0.55
-#: Newton's method: steps at most, and relative error at which it ends.
-_STEPS, _CLOSE = 6, 3e-3
-#: A variance that changes by less than this part is taken as it is.
-_ALIKE = 0.08
+#: Newton's method: steps at most, relative error at which it ends; relative change of a variance that is neglected.
+_STEPS, _CLOSE, _ALIKE = 6, 3e-3, 0.08
 #: Pixels that a loop takes at a time, so that its numbers stay in the cache.
 _RUN = 512
 

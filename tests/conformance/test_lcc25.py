@@ -152,8 +152,7 @@ def test_a_capture_of_named_states(
 ) -> None:
     plan = tmp_path / "plan.yaml"
     plan.write_text(f"{PLAN}states: {{kind: table, angles: {{lcr: [quarter, 1.2, half, high, quarter]}}}}\n")
-    code, _, err = acquire("--plan", plan, "--rig", crystal_rig, "--out", tmp_path / "taken", "--yes")
-    assert code == 0, err
+    acquire.made("--plan", plan, "--rig", crystal_rig, "--out", tmp_path / "taken", "--yes")
     (path,) = (tmp_path / "taken").glob("*.h5")
     with h5py.File(path) as h5:
         axis = h5["entry/instrument/lcr"]
@@ -165,8 +164,7 @@ def test_a_capture_of_named_states(
     assert dataset["lcr_V"].attrs["units"] == "V"
     with h5py.File(write_dataset(dataset, tmp_path / "again.h5")) as h5:
         assert h5["entry/instrument/lcr/value"].attrs["units"] == "V"
-    code, _, err = process("reduce", path, "--out", tmp_path / "stokes.h5", "--no-figure")
-    assert code == 0, err
+    process.made("reduce", path, "--out", tmp_path / "stokes.h5", "--no-figure")
     # Light of the unpolarized source, straight through; no voltage shows its part at 45 degrees.
     stokes = open_dataset(tmp_path / "stokes.h5")["mueller"].mean(("y", "x")).to_numpy()[:, 0]
     np.testing.assert_allclose(stokes / stokes[0], [1, 0, np.nan, 0], atol=0.01)

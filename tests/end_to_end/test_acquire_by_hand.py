@@ -78,8 +78,7 @@ def test_home_then_move_then_stop(acquire, served):
     assert code == 1
     assert "no reference" in err
     assert acquire("home", "arm", "--rig", rig)[0] == 0
-    code, out, err = acquire("move", "arm", 30, "--rig", rig)
-    assert code == 0, err
+    out = acquire.made("move", "arm", 30, "--rig", rig)
     assert "arm at 30.0" in out
     assert simulation.true_angles_deg()["arm"] == pytest.approx(30, abs=0.01)
     # The other axes were not homed, because nobody asked.
@@ -105,8 +104,7 @@ def test_move_is_refused(acquire, served, axis, degrees, words):
 
 def test_snap_writes_counts_and_leaves_the_light_as_it_was(acquire, served, tmp_path):
     simulation, rig = served
-    code, out, err = acquire("snap", "--rig", rig, "--out", tmp_path / "frame.tif", "--exposure", 0.02)
-    assert code == 0, err
+    out = acquire.made("snap", "--rig", rig, "--out", tmp_path / "frame.tif", "--exposure", 0.02)
     assert "SIMULATED" in out
     frame = cv2.imread(str(tmp_path / "frame.simulated.tif"), cv2.IMREAD_UNCHANGED)
     assert frame.dtype == "uint16"
@@ -118,8 +116,7 @@ def test_snap_sees_the_bench_as_it_is_not_as_it_was_declared(acquire, small_rig,
     means = []
     for name, simulator in (("declared", {}), ("true", {"truth": {"drr": str(dim_instrument)}})):
         rig = small_rig(f"{name}.yaml", rows=24, columns=32, **simulator)
-        code, _, err = acquire("snap", "--rig", rig, "--out", tmp_path / f"{name}.npy", "--exposure", 0.1, "--light")
-        assert code == 0, err
+        acquire.made("snap", "--rig", rig, "--out", tmp_path / f"{name}.npy", "--exposure", 0.1, "--light")
         means.append(np.load(tmp_path / f"{name}.simulated.npy").mean() - BLACK_LEVEL)
     assert means[1] == pytest.approx(0.1 * means[0], rel=0.05)
 

@@ -18,8 +18,7 @@ def _path(out: str):
 
 def test_every_frame_shows_the_angles_that_its_metadata_claims(acquire, small_rig, tmp_path):
     rig = small_rig(stamp=True)
-    code, out, err = acquire("--omega", 35, "--rig", rig, "--out", tmp_path)
-    assert code == 0, err
+    out = acquire.made("--omega", 35, "--rig", rig, "--out", tmp_path)
     with Capture(_path(out)) as capture:
         assert capture.role == ("dark",) * 4 + ("sample",) * 40
         axes = sorted(capture.angles_deg)
@@ -74,8 +73,7 @@ def test_same_plan_and_seed_give_the_same_bytes(acquire, small_rig, tmp_path):
     plan.write_text("kind: plan\ndarks: 2\nstates: {kind: rotating_retarders, states: 20, step_deg: 18}\n")
 
     def frames(folder, seed):
-        code, out, err = acquire("--plan", plan, "--rig", small_rig(), "--seed", seed, "--out", tmp_path / folder)
-        assert code == 0, err
+        out = acquire.made("--plan", plan, "--rig", small_rig(), "--seed", seed, "--out", tmp_path / folder)
         with h5py.File(_path(out)) as file:
             return file["entry/instrument/detector/data"][...]
 
@@ -102,8 +100,7 @@ def test_stokes_capture_is_a_mosaic_under_horizontal_light(acquire, small_rig, t
 
 def test_dry_run_moves_nothing_and_writes_nothing(acquire, small_rig, tmp_path):
     out_folder = tmp_path / "captures"
-    code, out, err = acquire("--omega", 35, "--rig", small_rig(), "--out", out_folder, "--dry-run")
-    assert code == 0, err
+    out = acquire.made("--omega", 35, "--rig", small_rig(), "--out", out_folder, "--dry-run")
     assert "nothing was moved" in out
     assert "limits of psa" in out
     assert not out_folder.exists()
@@ -112,8 +109,7 @@ def test_dry_run_moves_nothing_and_writes_nothing(acquire, small_rig, tmp_path):
 def test_averaged_frames_say_so(acquire, small_rig, tmp_path):
     plan = tmp_path / "plan.yaml"
     plan.write_text("kind: plan\nmode: stokes\nstates: {kind: fixed, states: 2}\nrepeats: 5\ndarks: 1\n")
-    code, out, err = acquire("--plan", plan, "--rig", small_rig(), "--out", tmp_path)
-    assert code == 0, err
+    out = acquire.made("--plan", plan, "--rig", small_rig(), "--out", tmp_path)
     with Capture(_path(out)) as capture:
         assert capture.column("repeats").tolist() == [5, 5, 5]
 
@@ -123,8 +119,7 @@ def test_exposure_is_recorded_as_the_camera_reads_it_back(acquire, small_rig, tm
     plan = tmp_path / "plan.yaml"
     text = "kind: plan\nmode: stokes\nexposure_s: 0.0000254\nbracket: [1, 100]\ndarks: 1\n"
     plan.write_text(text + "states: {kind: fixed, states: 2}\n")
-    code, out, err = acquire("--plan", plan, "--rig", small_rig(), "--out", tmp_path)
-    assert code == 0, err
+    out = acquire.made("--plan", plan, "--rig", small_rig(), "--out", tmp_path)
     with Capture(_path(out)) as capture:
         np.testing.assert_allclose(capture.column("exposure_s"), np.tile([25e-6, 2540e-6], 3), rtol=1e-9)
 
@@ -138,8 +133,7 @@ def test_bracketed_capture_sees_dark_and_bright_pixels(acquire, small_rig, tmp_p
     plan = tmp_path / "plan.yaml"
     plan.write_text("kind: plan\nexposure_s: 0.005\nbracket: [1, 8]\ndarks: 2\n")
     rig = small_rig(flux_e_per_s=3.2e6, top={"interlocks": [{"kind": "saturation", "limit": 0.001}]})
-    code, out, err = acquire("--plan", plan, "--rig", rig, "--out", tmp_path)
-    assert code == 0, err
+    out = acquire.made("--plan", plan, "--rig", rig, "--out", tmp_path)
     path = _path(out)
     with Capture(path) as capture:
         assert capture.role == ("dark",) * 4 + ("sample",) * 80
@@ -152,8 +146,7 @@ def test_bracketed_capture_sees_dark_and_bright_pixels(acquire, small_rig, tmp_p
         unsaturated = (long < 3900) & (long > 500)
         assert (long[unsaturated] / short[unsaturated]).mean() == pytest.approx(8, rel=0.02)
     merged = _m00(path, "--weighted")
-    code, out, err = acquire("--omega", 35, "--exposure", 0.005, "--rig", rig, "--out", tmp_path / "single")
-    assert code == 0, err
+    out = acquire.made("--omega", 35, "--exposure", 0.005, "--rig", rig, "--out", tmp_path / "single")
     single = _m00(_path(out))
     # m00 is in counts of the longest exposure.
     bright = single > 0.3 * single.max()

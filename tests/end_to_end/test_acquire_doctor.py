@@ -86,8 +86,7 @@ def test_snap_with_an_led_driver_has_the_light_that_was_selected(acquire, small_
     source = {"kind": "dc4100", "port": "sim:leds", "percent": {662: 100, 524: 0}}
     rig = small_rig(top={"source": source, "interlocks": []}, ports=PORTS | {"leds": {"kind": "dc4100"}})
     out_file = tmp_path / "frame.npy"
-    code, _, err = acquire("snap", "--wavelength", wavelength, "--rig", rig, "--out", out_file, "--sample", "red_flat")
-    assert code == 0, err
+    acquire.made("snap", "--wavelength", wavelength, "--rig", rig, "--out", out_file, "--sample", "red_flat")
     mean = np.load(tmp_path / "frame.simulated.npy").mean()
     # The black level is 64: at 0 % nothing is added to it.
     assert (mean > 80) == (wavelength == 662)
@@ -100,9 +99,7 @@ def test_snap_without_a_wavelength_asks_for_one(acquire, small_rig, tmp_path):
     code, _, err = acquire("snap", "--rig", rig, "--out", tmp_path / "frame.png")
     assert code == 1
     assert "no wavelength was selected" in err
-    code, _, err = acquire("snap", "--rig", rig, "--out", tmp_path / "frame.bmp")
-    assert code == 2
-    assert ".npy" in err
+    assert ".npy" in acquire.refused("snap", "--rig", rig, "--out", tmp_path / "frame.bmp")
 
 
 def test_a_source_switched_by_hand_needs_no_port(acquire, small_rig):

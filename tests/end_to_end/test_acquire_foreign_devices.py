@@ -67,8 +67,7 @@ def test_a_filter_wheel_chooses_the_wavelength_and_makes_the_darks(
     plan = tmp_path / "plan.yaml"
     plan.write_text("kind: plan\nmode: stokes\ndarks: 1\nexposure_s: 0.005\nstates: {kind: fixed, states: 1}\n")
     out = tmp_path / "captures"
-    code, _, err = acquire("--rig", rig, "--plan", plan, "--sample", "air", "--omega", 180, "--out", out)
-    assert code == 0, err
+    acquire.made("--rig", rig, "--plan", plan, "--sample", "air", "--omega", 180, "--out", out)
     with Capture(next(out.glob("*.h5"))) as capture:
         dark, light = (float(capture.frames(k).mean()) for k in (0, 1))
         assert light > 3 * dark

@@ -54,14 +54,12 @@ def test_without_devices_it_says_so(monkeypatch, tmp_path):
 def test_devices_of_a_configuration_of_micro_manager_are_listed(acquire, tmp_path):
     bench = tmp_path / "bench.cfg"
     bench.write_text("# made by hand\nProperty,Core,Initialize,0\nDevice,Rotator,DemoCamera,DStage\nLabel,x,0,y\n")
-    code, _, err = acquire("init", "--out", tmp_path / "rig.yaml", "--micromanager", bench)
-    assert code == 0, err
+    acquire.made("init", "--out", tmp_path / "rig.yaml", "--micromanager", bench)
     text = (tmp_path / "rig.yaml").read_text()
     assert "#  Rotator: DemoCamera DStage\n" in text
     assert f"kind: mmcore, device: LABEL, configuration: {bench}" in text
     load_rig(tmp_path / "rig.yaml")
     bench.write_text("Device,Rotator\n")
-    code, _, err = acquire("init", "--out", tmp_path / "other.yaml", "--micromanager", bench)
-    assert code == 2
+    err = acquire.refused("init", "--out", tmp_path / "other.yaml", "--micromanager", bench)
     assert "Save it in Micro-Manager" in err
     assert not (tmp_path / "other.yaml").exists()

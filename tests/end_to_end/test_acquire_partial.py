@@ -65,8 +65,7 @@ def test_from_plan_to_product(name, acquire, small_rig, configs, tmp_path):
     rig = rig_of(name, small_rig, configs)
     plan = tmp_path / "plan.yaml"
     plan.write_text(PLAN.format(name=name, states=states))
-    code, _, err = acquire("--plan", plan, "--rig", rig, "--out", tmp_path / "out")
-    assert code == 0, err
+    acquire.made("--plan", plan, "--rig", rig, "--out", tmp_path / "out")
     (capture,) = (tmp_path / "out").glob("*.h5")
     assert exit_code(process, "reduce", capture, "--out", tmp_path / "m.h5", "--no-figure") == 0
     image = MuellerImage.load(tmp_path / "m.h5")

@@ -92,8 +92,7 @@ def test_any_rig_takes_a_capture(acquire, configs, tmp_path, parts, source):
         maker.add(kind, names)
     plan = tmp_path / "plan.yaml"
     plan.write_text(PLAN)
-    code, _, err = acquire("--omega", 35, "--plan", plan, "--rig", maker.write(source), "--out", tmp_path)
-    assert code == 0, err
+    acquire.made("--omega", 35, "--plan", plan, "--rig", maker.write(source), "--out", tmp_path)
     with Capture(next(tmp_path.glob("*.h5"))) as capture:
         assert capture.status == "complete"
         for state in range(17):

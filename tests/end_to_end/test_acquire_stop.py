@@ -134,11 +134,9 @@ def test_homing_asks_first(acquire, served):
     assert "in this order: arm, psg, psa" in out
     assert "nothing was moved" in err
     assert not any(axis.homed or axis.is_moving() for axis in simulation.emulators["rotators"].axes)
-    code, out, err = acquire("home", "psa", "--yes", "--rig", rig)
-    assert code == 0, err
+    acquire.made("home", "psa", "--yes", "--rig", rig)
     assert [axis.homed for axis in simulation.emulators["rotators"].axes] == [False, True]
-    code, out, err = acquire("move", "psa", -12.5, "--rig", rig)
-    assert code == 0, err
+    out = acquire.made("move", "psa", -12.5, "--rig", rig)
     assert "psa at -12.5" in out
     assert simulation.true_angles_deg()["psa"] == pytest.approx(-12.5, abs=0.01)
 

@@ -35,8 +35,7 @@ def scaled(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 @pytest.mark.long
 def test_mueller_image_and_xi0_agree_with_the_scene(acquire, small_rig, configs: Path, tmp_path: Path) -> None:
-    code, out, err = acquire("--omega", 35, "--rig", small_rig(), "--out", tmp_path)
-    assert code == 0, err
+    out = acquire.made("--omega", 35, "--rig", small_rig(), "--out", tmp_path)
     capture = taken(out)
     process("reduce", capture, "--no-figure")
     image = MuellerImage.load(capture.with_suffix(".mueller.h5"))
@@ -99,8 +98,7 @@ def test_stokes_capture_without_arm_angle(configs: Path, synthetic_capture, tmp_
     [("air", 180, np.eye(4)), ("mirror", 10, np.diag([1.0, 1.0, -1.0, -1.0]))],
 )
 def test_known_samples(sample: str, omega: int, expected: np.ndarray, acquire, small_rig, tmp_path: Path) -> None:
-    code, out, err = acquire("--sample", sample, "--omega", omega, "--rig", small_rig(), "--out", tmp_path)
-    assert code == 0, err
+    out = acquire.made("--sample", sample, "--omega", omega, "--rig", small_rig(), "--out", tmp_path)
     capture = taken(out)
     process("reduce", capture, "--no-figure")
     image = MuellerImage.load(capture.with_suffix(".mueller.h5"))

@@ -29,8 +29,7 @@ CASES = [
 @pytest.mark.long
 @pytest.mark.parametrize("seed", CASES)
 def test_the_loop_is_closed(acquire, configs, tmp_path, seed):
-    code, out, err = acquire("demo", "--seed", seed, "--out", tmp_path)
-    assert code == 0, err
+    out = acquire.made("demo", "--seed", seed, "--out", tmp_path)
     (folder,) = tmp_path.iterdir()
     # What was built in is shown at the end alone, and it is what was sealed at the beginning.
     before, after = out.split("The truth is opened")
@@ -66,8 +65,7 @@ def test_every_kind_can_be_asked_for(kind):
 
 
 def test_what_cannot_be_drawn_is_refused_with_its_reason(acquire, tmp_path):
-    code, _, err = acquire("demo", "--only", "detector_offset", "--out", tmp_path)
-    assert code == 2
+    err = acquire.refused("demo", "--only", "detector_offset", "--out", tmp_path)
     # Alarms of other runs on this machine may come first.
     assert err.splitlines()[-1] == "error: --only detector_offset: the dark states of the default plan measure it."
     with pytest.raises(ConfigError, match="there is no such fault, only psg_retardance"):

@@ -202,8 +202,7 @@ def test_the_stack_of_a_recipe_is_that_of_no_other_measurement(day, process):
     (runs[1] / "frames.npy.csv").write_bytes((runs[1] / "log.csv").read_bytes())
     options = ("--recipe", "first.import.yaml", runs[1] / "frames.npy")
     for more in ((), ("--states", "{item}.csv")):
-        code, _, errors = process("import", *options, *more, "--out", "second.h5", "--overwrite")
-        assert code == 0, errors
+        process.made("import", *options, *more, "--out", "second.h5", "--overwrite")
         with Capture(Path("first.h5")) as first, Capture(Path("second.h5")) as second:
             assert np.array_equal(first.frames(4) + 7, second.frames(4))
 
@@ -248,8 +247,7 @@ def test_two_beams_on_one_sensor(tmp_path, process):
         cv2.imwrite(str(tmp_path / f"hwp_{angle}.tif"), frame)
     out = tmp_path / "c.h5"
     command = ("import", "--stack", tmp_path / "hwp_{hwp}.tif", "--wavelength-nm", 550)
-    code, _, err = process(*command, "--instrument", tmp_path / "beams.yaml", "--out", out)
-    assert code == 0, err
+    process.made(*command, "--instrument", tmp_path / "beams.yaml", "--out", out)
     with Capture(out) as capture:
         assert (capture.channel_names, capture.frame_shape) == (("o", "e"), (4, 6))
     assert process("reduce", out, "--no-figure")[0] == 0

@@ -68,8 +68,7 @@ def test_a_place_for_no_file_is_refused_before_the_work(acquire, small_rig, capt
     code, _, err = acquire("--omega", 35, "--rig", small_rig(), "--out", capture)
     assert (code, f"{capture} is a file, and captures need a folder" in err) == (2, True)
     for command in (("snap", "--out", "no/frame.png"), ("init", "--out", "no/rig.yaml")):
-        code, _, err = acquire(*command)
-        assert (code, "there is no folder no. Make it" in err) == (2, True)
+        assert "there is no folder no. Make it" in acquire.refused(*command)
     instrument = configs / "instruments/rgb950.yaml"
     assert exit_code(diagnose, capture, "--instrument", instrument, "--write", "no/where.yaml") == 2
     message = "error: no/where.yaml: there is no folder no. Make it, or give another name.\n"
@@ -162,5 +161,4 @@ def test_a_file_that_is_not_meant_is_called_what_it_is(run, acquire, capture, co
         assert (code, err) == (0, "")
         assert product.name not in out
         assert "table.h5" not in out
-        code, _, err = acquire(command, folder)
-        assert (code, "there is no capture in this folder" in err) == (2, True)
+        assert "there is no capture in this folder" in acquire.refused(command, folder)

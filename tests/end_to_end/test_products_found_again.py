@@ -34,12 +34,7 @@ Run = Callable[..., str]
 def process(process: Callable[..., tuple[int, str, str]]) -> Run:
     """Runs `process ARGS`, which has to succeed; standard output."""
 
-    def run(*arguments: object) -> str:
-        code, out, err = process(*arguments)
-        assert code == 0, err
-        return out
-
-    return run
+    return process.made
 
 
 @pytest.fixture(scope="module")

@@ -43,8 +43,7 @@ def unused(tmp_path):
 @pytest.mark.parametrize("more", [(), ("--as-new",)])
 def test_a_capture_is_resumed_with_a_rig_file_of_ones_own_only(nobody, foreign_capture, acquire, tmp_path, more):
     before = foreign_capture.read_bytes()
-    code, _, err = acquire("--resume", foreign_capture, *more)
-    assert code == 2, err
+    err = acquire.refused("--resume", foreign_capture, *more)
     assert " ".join(("acquire --resume", str(foreign_capture), "--rig RIG.yaml", *more)) in err
     assert foreign_capture.read_bytes() == before
     assert unused(tmp_path)
@@ -90,7 +89,6 @@ def test_a_campaign_among_captures_does_not_choose_the_rig(nobody, quick_rig, ac
     campaign["rig"] = str(rig)
     campaign["plans"] = {mode: str(configs / "plans" / f"{mode}.yaml") for mode in campaign["plans"]}
     yaml.dump(campaign, folder / "campaign.yaml")
-    code, _, err = acquire("--campaign", folder / "campaign.yaml", "--out", tmp_path / "out")
-    assert code == 2
+    err = acquire.refused("--campaign", folder / "campaign.yaml", "--out", tmp_path / "out")
     assert f"acquire --campaign {folder / 'campaign.yaml'} --rig RIG.yaml" in err
     assert unused(tmp_path)

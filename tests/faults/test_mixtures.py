@@ -126,19 +126,14 @@ def test_other_devices_and_camera_settings_are_refused(partial):
 
 def test_plan_options_are_refused_with_resume(partial, acquire):
     for option in (("--omega", 50), ("--exposure", 0.5), ("--seed", 3)):
-        code, _, err = acquire("--resume", partial, *option)
-        assert code == 2
-        assert f"{option[0]} has no meaning with --resume" in err
+        assert f"{option[0]} has no meaning with --resume" in acquire.refused("--resume", partial, *option)
 
 
 def test_as_new_keeps_apart(partial, quick_rig, acquire, intact):
     before = partial.read_bytes()
     edited_rig = _edited(quick_rig(), detector__black_level_counts=70)
-    code, _, err = acquire("--resume", partial, "--rig", edited_rig)
-    assert code == 2
-    assert "--as-new" in err
-    code, _, err = acquire("--resume", partial, "--rig", edited_rig, "--as-new")
-    assert code == 0, err
+    assert "--as-new" in acquire.refused("--resume", partial, "--rig", edited_rig)
+    acquire.made("--resume", partial, "--rig", edited_rig, "--as-new")
     assert partial.read_bytes() == before
     assert intact(partial.parent / "run-2.h5") == 19
 
@@ -202,8 +197,7 @@ def test_a_capture_begun_in_the_same_second_gets_the_next_name(acquire, quick_ri
     monkeypatch.setattr("acquisition.commands.single.default_name", lambda plan: "same.h5")
     (tmp_path / "out").mkdir()
     (tmp_path / "out/same.h5").write_bytes(b"of this second")
-    code, out, err = acquire("--plan", plan, "--rig", quick_rig(), "--out", tmp_path / "out")
-    assert code == 0, err
+    out = acquire.made("--plan", plan, "--rig", quick_rig(), "--out", tmp_path / "out")
     assert "same-2.h5" in out
     assert intact(tmp_path / "out/same-2.h5") == 19
     assert (tmp_path / "out/same.h5").read_bytes() == b"of this second"

@@ -51,8 +51,7 @@ def test_a_rig_served_by_the_command_line_takes_a_capture(quick_rig, acquire, in
     try:
         assert server.stdout.readline().strip() == str(tmp_path / "rig.yaml")
         assert "sim:" not in (tmp_path / "rig.yaml").read_text()
-        code, out, err = acquire("--omega", 35, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "out")
-        assert code == 0, err
+        out = acquire.made("--omega", 35, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "out")
         assert "SIMULATED" in out
         assert intact(next((tmp_path / "out").glob("*.h5"))) == 44
     finally:

@@ -226,8 +226,7 @@ def test_a_full_disc_at_the_quick_look_fails_no_complete_capture(acquire, quick_
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(quicklook, "draw", full)
-    code, out, err = acquire("--omega", 35, "--mode", "stokes", "--rig", quick_rig(), "--out", tmp_path)
-    assert code == 0, err
+    out = acquire.made("--omega", 35, "--mode", "stokes", "--rig", quick_rig(), "--out", tmp_path)
     assert "not drawn (No space left on device)" in out
     with Capture(next(tmp_path.glob("*.h5"))) as capture:
         assert capture.status == "complete"

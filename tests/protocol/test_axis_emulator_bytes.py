@@ -126,6 +126,16 @@ def test_smc100() -> None:
     assert talk(line, b"1TS\r\n") == b"1TS00000A\r\n"
 
 
+def test_smc100_stop_without_an_address_stops_all() -> None:
+    line, clock = emulator("smc100", homed=True, axes=2)
+    talk(line, b"1PA170\r\n2PA170\r\n")
+    clock.sleep_s(0.2)
+    talk(line, b"ST\r\n")
+    run_out(line, clock)
+    assert 0 < line.true_deg(0) < 100
+    assert line.true_deg(1) == pytest.approx(line.true_deg(0))
+
+
 def h(text: str) -> bytes:
     return bytes.fromhex(text)
 
@@ -164,6 +174,34 @@ def test_apt_stepper() -> None:
     assert talk(unit, h("11 02 01 00 50 01")) == h("12 02 01 02 01 50")
     talk(unit, h("48 04 06 00 d0 01 01 00 00 00 01 00"))
     assert run_out(unit, clock) == b""
+
+
+def test_apt_dc_servo_and_its_periodic_status() -> None:
+    unit, clock = emulator("apt-kdc101", homed=True)
+    info = talk(unit, h("05 00 00 00 50 01"))
+    assert int.from_bytes(info[6:10], "little") == 27_000_001
+    assert info[6 + 76] == 6
+    assert talk(unit, h("90 04 01 00 50 01"))[:6] == h("91 04 0e 00 81 50")
+    assert talk(unit, h("14 04 01 00 50 01"))[:8] == h("15 04 0e 00 81 50 01 00")
+    talk(unit, h("11 00 00 00 50 01"))
+    clock.sleep_s(0.15)
+    assert unit.take_output()[:2] == h("91 04")
+    talk(unit, h("12 00 00 00 50 01"))
+    clock.sleep_s(1.0)
+    assert unit.take_output() == b""
+
+
+def test_apt_rack_and_its_bays() -> None:
+    rack, clock = emulator("apt-bsc203", axes=2)
+    info = talk(rack, h("05 00 00 00 11 01"))
+    assert info[:6] == h("06 00 54 00 81 11")
+    assert info[10:18] == b"BSC203\0\0"
+    # The bays from 0 on: occupied, occupied, empty.
+    for bay, state in ((0, 1), (1, 1), (2, 2)):
+        assert talk(rack, bytes((0x60, 0, bay, 0, 0x11, 1))) == bytes((0x61, 0, bay, state, 1, 0x11))
+    assert talk(rack, h("11 04 01 00 23 01")) == b""
+    assert talk(rack, h("43 04 01 00 22 01")) == b""
+    assert run_out(rack, clock) == h("44 04 01 00 01 22")
 
 
 def test_a_k10cr2_sends_a_longer_status_and_a_malformed_address() -> None:
