@@ -330,3 +330,9 @@ def test_a_gsc_02_is_silent_and_must_be_told_the_way_home() -> None:
     assert talk(box, b"M:W+P400-P800\r\nG\r\n") == b""
     clock.sleep_s(60.0)
     assert talk(box, b"Q:\r\n") == b"       400,-      800,K,K,R\r\n"
+
+
+def test_a_conex_agp_knows_no_speed() -> None:
+    box, _ = emulator("conex-agp")
+    assert talk(box, b"1VE\r\n").startswith(b"1VE CONEX-AGP")
+    assert talk(box, b"1VA?\r\n1TE\r\n") == b"1TED\r\n"
