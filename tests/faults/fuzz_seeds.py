@@ -17,7 +17,7 @@ import numpy as np
 from acquisition.campaign.log import read_index
 from acquisition.campaign.plan import Campaign, captures
 from acquisition.capture.plan import MeasurementPlan
-from acquisition.rig.config import RigConfig, load_rig
+from acquisition.rig.config import load_rig
 from processing.geometry.mesh import Mesh
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
@@ -81,9 +81,6 @@ def _spoil_h5(rng: random.Random, path: Path) -> None:
         spoil.spoil_h5(rng, path)
 
 
-# --- YAML -------------------------------------------------------------------------------------------------
-
-
 def _yaml_door(*folders: str, read: Callable[[Path], str | None]) -> Door:
     def make(folder: Path) -> Sequence[Path]:
         paths = []
@@ -99,12 +96,8 @@ def _yaml_door(*folders: str, read: Callable[[Path], str | None]) -> Door:
 
 
 def _rig(path: Path) -> str | None:
-    rig = load_rig(path)
-    return _rig_that_cannot_be_meant(rig)
-
-
-def _rig_that_cannot_be_meant(rig: RigConfig) -> str | None:
     """Looked at here once more in the plainest words, apart from the program's own checks."""
+    rig = load_rig(path)
     for name, axis in rig.axes.items():
         low, high = axis.limits_deg or (None, None)
         ends = [end for end in (low, high) if end is not None]

@@ -1,13 +1,10 @@
 """Byte transcripts: what each driver writes and how it reads the replies; a pair that is not used fails."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from drivers.apt_frames import apt_framer
 from drivers.axes import apt, elliptec, esp301, gcs2, gsc, lcc25, smc100, zaber
 from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
-from drivers.serial_link import LONGEST_FRAME, line_framer
 from simulators.clock import FastClock, patient_clock
 from simulators.controllers import elliptec as elliptec_emulator
 from simulators.controllers import esp301 as esp301_emulator
@@ -225,18 +222,6 @@ def test_readings_that_disagree_are_no_position() -> None:
         arm = smc100.open("arm", smc100.Config(port=path), lines)
         with pytest.raises(ReplyError, match="contradict"):
             arm.read_position()
-
-
-@given(st.lists(st.binary(max_size=300), max_size=20))
-def test_framers_take_any_bytes_and_keep_little(pieces: list[bytes]) -> None:
-    for framer, longest in ((line_framer, LONGEST_FRAME + 300), (apt_framer, 6 + 84)):
-        buffer = bytearray()
-        for piece in pieces:
-            buffer += piece
-            while (frame := framer(buffer)) is not None:
-                assert frame
-                zaber.parse_reply(frame)
-        assert len(buffer) <= longest
 
 
 @pytest.mark.parametrize(

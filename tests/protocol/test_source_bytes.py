@@ -139,9 +139,6 @@ def test_what_a_cornerstone_cannot_do_is_refused_by_name() -> None:
             source.set_light(False)
 
 
-# --- DC2200 -----
-
-
 def test_a_dc2200_drives_one_led_at_a_time() -> None:
     emulator = DC2200Emulator(FastClock(base=patient_clock()))
     with served(emulator) as (path, lines):
