@@ -35,8 +35,7 @@ from processing.storage.formats.tensor_file import create_tensor_file, read_tens
 from processing.storage.products.product import Product, Step
 from simulators.bench.scene import Scene
 
-ROOT = Path(__file__).resolve().parents[2]
-CONFIGS = ROOT / "configs"
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 INSTRUMENT = CONFIGS / "instruments" / "rgb950.yaml"
 
 
