@@ -28,7 +28,7 @@ from processing.diagnosis.search.candidate import Candidate, SourceLevel, nomina
 from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.rules import EXACT
 from processing.diagnosis.search.space import Space, Sums
-from processing.instrument.applied_effects import apply_to, changes_of
+from processing.instrument.applied_effects import changes_of
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
 
@@ -238,14 +238,12 @@ class InstrumentProblem:
         if key not in cache:
             if len(cache) > MOST_ASKED:
                 cache.clear()
-            changes = cache[key] = Changes(data.conditions)
+            changes = Changes(data.conditions) if candidate else changes_of(model, data.conditions, data.name)
             if candidate:
                 candidate.apply(changes, model, values)
             else:
-                for applied in model.effects:
-                    if applied.scope == "instrument" or data.name in applied.captures:
-                        apply_to(changes, model, applied)
                 changes.shift_px = changes.shift_px - self.own_px[capture] * data.pitch
+            cache[key] = changes
         return cache[key]
 
     @property
@@ -280,10 +278,8 @@ class InstrumentProblem:
 
     def _columns_of_one_source(self, capture: int, changes: Changes) -> Array:
         """A (L, K) where the source has the same level in all states."""
-        data = self.captures[capture]
-        w = self.rows_of(capture, changes) * data.row_exposure[:, None]
-        a = w if data.sample is None else (w @ data.sample)[:, None]
-        return np.asarray(a / self.moments[capture].sigma[:, None])
+        rows = self.captures[capture].rows_of(self.models[capture], changes)
+        return np.asarray(rows / self.moments[capture].sigma[:, None])
 
     def channels(self, capture: int) -> int:
         """Channels of the detector."""

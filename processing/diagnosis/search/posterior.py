@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processing.arrays import Array, BoolArray
-from processing.diagnosis.search.averages import Samples, sample, stay
+from processing.diagnosis.search.averages import Samples, likely_starts, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.descent import (
     STEPS,
@@ -30,11 +30,11 @@ from processing.diagnosis.search.rules import (
     BENT,
     CERTAIN,
     CHANGES,
+    FEWER_CHANGES,
     FEWER_ROUNDS,
     GROWTH,
     NEEDED,
     ROUNDS,
-    SAMPLES,
     SURE,
     TAU,
 )
@@ -102,11 +102,15 @@ def fit_posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], st
     """
     members, groups = group_candidates(space, fixed)
     about, sets, state, rivals = _expand(problem, space, fixed, members, groups=groups, start=start)
-    # Where what is left is the noise, each set has a unit of its own, and counts by its evidence.
-    samples = stay(sets, state, CHANGES) if sets.noise.is_known else sample(sets, state, SAMPLES)
+    samples = stay(sets, likely_starts(sets, state), CHANGES if problem.noise_known else FEWER_CHANGES)
     labels = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(labels) or 'nothing'}; unit of chi-square {state.unit:.3g}")
-    return _posterior_of(problem, space, members, sets, samples=samples, about=about, rivals=rivals)
+    typical, values = space.joined("typical"), mean_over_sets(space, samples, np.ones(space.size))
+    sums = problem.sums(space, values, derivatives=False)
+    if not sets.noise.unit(sums.chi2(problem.noise_known)) <= GROWTH * sets.noise.unit(sets.form.at(values / typical)):
+        # The least certain values lie along a bent valley, in which the straight line to their mean does not stay.
+        values = descend(problem, space, groups, samples, starts=[about], steps=2 * STEPS)
+    return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical), rivals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,22 +227,3 @@ def _settle(problem: Problem, space: Space, first: _Round, look: Look, *, rounds
         now = new
     problem.relinearize(space, now.about)
     return now
-
-
-def _posterior_of(
-    problem: Problem,
-    space: Space,
-    members: tuple[tuple[int, ...], ...],
-    sets: Sets,
-    *,
-    samples: Samples,
-    about: Array,
-    rivals: Mapping[int, tuple[int, ...]],
-) -> Posterior:
-    """The posterior of a problem linearized `about` values (K,)."""
-    typical, values = space.joined("typical"), mean_over_sets(space, samples, np.ones(space.size))
-    sums = problem.sums(space, values, derivatives=False)
-    if not sets.noise.unit(sums.chi2(problem.noise_known)) <= GROWTH * sets.noise.unit(sets.form.at(values / typical)):
-        # The least certain values lie along a bent valley, in which the straight line to their mean does not stay.
-        values = descend(problem, space, sets.groups, samples, starts=[about], steps=2 * STEPS)
-    return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical), rivals)
