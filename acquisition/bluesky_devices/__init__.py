@@ -46,7 +46,16 @@ class BlueskyBench:
 
     def capture(self, plan: MeasurementPlan, folder: Path | str, name: str = "capture") -> CaptureDevice:
         """A device that takes captures by a plan. Raises PlanRefused."""
-        return CaptureDevice(name, self.rig, self.turn, plan, folder=folder, home=self.home, arm=self.axes.get(ARM))
+        return CaptureDevice(
+            name,
+            self.rig,
+            self.turn,
+            plan,
+            folder=folder,
+            home=self.home,
+            arm=self.axes.get(ARM),
+            interlock=self.interlock,
+        )
 
 
 @contextmanager

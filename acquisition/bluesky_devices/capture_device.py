@@ -2,6 +2,7 @@
 
 import math
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -9,7 +10,7 @@ from typing import Any, Literal
 from acquisition.bluesky_devices.axis_and_camera import AxisDevice
 from acquisition.bluesky_devices.device import BlueskyDevice, Readings, data_key, readings
 from acquisition.bluesky_devices.frames_in_files import Documents, asset_documents, external_key
-from acquisition.bluesky_devices.settings import SettingDevice
+from acquisition.bluesky_devices.settings import InterlockDevice, SettingDevice
 from acquisition.bluesky_devices.status import MoveStatus, in_background
 from acquisition.capture import session
 from acquisition.capture.checks import refuse_failed
@@ -18,7 +19,7 @@ from acquisition.capture.header import default_name
 from acquisition.capture.job import Job, Result, check_with_devices, job_of, prepare
 from acquisition.capture.partial_file import PARTIAL
 from acquisition.capture.plan import MeasurementPlan
-from acquisition.errors import AcquisitionError
+from acquisition.errors import AcquisitionError, InterlockOpened, PlanRefused
 from acquisition.rig.rig import Rig
 from acquisition.stop_request import StopRequest
 from processing.storage.captures.capture import Capture
@@ -26,6 +27,8 @@ from processing.storage.captures.schema import COLUMN_UNITS, position_column
 
 #: Columns of the file with a value for each state, in addition to the angles.
 COLUMNS = ("exposure_s", "host_time_s", "monitor", "saturated_fraction")
+#: A suspender sees an open interlock within this time, if at all.
+_SEEN_S = 1.0
 
 
 class CaptureDevice(BlueskyDevice):
@@ -42,6 +45,7 @@ class CaptureDevice(BlueskyDevice):
     folder : for the files, which are named as `acquire` names them.
     home : home axes without a reference before the first move of a capture.
     arm : the arm of the rig; None for a rig without.
+    interlock : a suspender that watches it pauses the capture when it opens, which otherwise fails.
     """
 
     def __init__(
@@ -54,10 +58,11 @@ class CaptureDevice(BlueskyDevice):
         folder: Path | str,
         home: bool,
         arm: AxisDevice | None,
+        interlock: InterlockDevice,
     ) -> None:
         super().__init__(name, rig, turn)
         self.plan, self.folder = plan, Path(folder)
-        self._arm = arm
+        self._arm, self._interlock = arm, interlock
         self._home = home
         self._job = prepare(plan, rig.config)
         self._stop = StopRequest()
@@ -69,8 +74,15 @@ class CaptureDevice(BlueskyDevice):
     def trigger(self) -> MoveStatus:
         """Take the capture, or the states that are missing after a pause."""
         self._stop = StopRequest()
-        self._taking = in_background(self._take)
+        self._taking = in_background(self._take_or_pause)
         return self._taking
+
+    def _take_or_pause(self) -> None:
+        try:
+            self._take()
+        except (InterlockOpened, PlanRefused):
+            if not self._await_pause():
+                raise
 
     def _take(self) -> None:
         with self.turn:
@@ -144,6 +156,13 @@ class CaptureDevice(BlueskyDevice):
             partial = path if path.name.endswith(PARTIAL) else path.with_name(path.name + PARTIAL)
             self._half = partial if partial.exists() else None
             raise
+
+    def _await_pause(self) -> bool:
+        """True if a suspender has seen the interlock too, and asks for a pause."""
+        end_s = time.monotonic() + _SEEN_S
+        while self._interlock.is_watched and not self._stop.requested and time.monotonic() < end_s:
+            time.sleep(0.01)
+        return self._stop.requested
 
     def pause(self) -> None:
         """Finish the state that is being taken; called by the RunEngine."""

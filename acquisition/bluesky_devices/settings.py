@@ -76,6 +76,11 @@ class InterlockDevice(BlueskyDevice):
         source = self.rig.source
         return int(source is not None and source.interlock_open())
 
+    @property
+    def is_watched(self) -> bool:
+        """Whether a function is to be called."""
+        return bool(self._watchers)
+
     def read(self) -> Readings:
         """The circuit now."""
         return readings({self.name: self.get()})

@@ -224,6 +224,26 @@ def _paused(run, device, folder) -> None:
         assert 5 <= len(capture.done) < capture.planned_states
 
 
+def test_an_interlock_that_opens_in_a_capture_suspends_it(bench, engine, monkeypatch, tmp_path):
+    run, documents = engine
+    moves, open_until_s = [], [0.0]
+    wait = bench.rig.wait
+
+    def wait_and_open(motions):
+        moves.append(motions)
+        if len(moves) == 7:
+            open_until_s[0] = time.monotonic() + 1.0
+        return wait(motions)
+
+    monkeypatch.setattr(bench.rig, "wait", wait_and_open)
+    monkeypatch.setattr(bench.rig.source, "interlock_open", lambda: time.monotonic() < open_until_s[0])
+    run.install_suspender(SuspendBoolHigh(bench.interlock))
+    run(count([bench.capture(SHORT, tmp_path / "captures")]))
+    (event,) = _events(documents)
+    with Capture(event["capture_file"]) as capture:
+        assert (capture.status, len(capture.segments), len(capture.done)) == ("complete", 2, capture.planned_states)
+
+
 def _omegas(documents):
     for event in _events(documents):
         with Capture(event["capture_file"]) as capture:
