@@ -19,7 +19,7 @@ from acquisition.capture.header import default_name
 from acquisition.capture.job import Job, Result, check_with_devices, job_of, prepare
 from acquisition.capture.partial_file import PARTIAL
 from acquisition.capture.plan import MeasurementPlan
-from acquisition.errors import AcquisitionError, InterlockOpened, PlanRefused
+from acquisition.errors import AcquisitionError, InterlockOpened
 from acquisition.rig.rig import Rig
 from acquisition.stop_request import StopRequest
 from processing.storage.captures.capture import Capture
@@ -80,7 +80,7 @@ class CaptureDevice(BlueskyDevice):
     def _take_or_pause(self) -> None:
         try:
             self._take()
-        except (InterlockOpened, PlanRefused):
+        except InterlockOpened:
             if not self._await_pause():
                 raise
 

@@ -1,5 +1,6 @@
 """Settings that a plan can change, and signals that a suspender can watch, as bluesky devices."""
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -8,6 +9,8 @@ from typing import Any
 from acquisition.bluesky_devices.device import BlueskyDevice, Readings, data_key, readings
 from acquisition.bluesky_devices.status import MoveStatus, in_background
 from acquisition.rig.rig import Rig
+
+log = logging.getLogger(__name__)
 
 #: How often a watched signal is read.
 _LOOK_S = 0.2
@@ -125,4 +128,8 @@ class InterlockDevice(BlueskyDevice):
                 changed, self._last = now != self._last, now
                 watchers = list(self._watchers)
             for function in watchers if changed else ():
-                function(value=now, timestamp=time.time(), obj=self)
+                try:
+                    function(value=now, timestamp=time.time(), obj=self)
+                except Exception:
+                    # A suspender fails while its RunEngine cannot be suspended; it has to hear of the end all the same.
+                    log.exception("%s: a watcher failed", self.name)

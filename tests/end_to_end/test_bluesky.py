@@ -244,6 +244,24 @@ def test_an_interlock_that_opens_in_a_capture_suspends_it(bench, engine, monkeyp
         assert (capture.status, len(capture.segments), len(capture.done)) == ("complete", 2, capture.planned_states)
 
 
+def test_the_interlock_is_still_watched_after_a_watcher_has_failed(bench, monkeypatch, caplog):
+    door, heard = {"open": False}, []
+    monkeypatch.setattr(bench.rig.source, "interlock_open", lambda: door["open"])
+
+    def fails(value, **_):
+        heard.append(value)
+        raise ValueError("no plan runs")
+
+    bench.interlock.subscribe(fails, run=False)
+    for state in (True, False):
+        door["open"] = state
+        deadline_s = time.monotonic() + 5
+        while (not heard or heard[-1] != state) and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+    assert heard == [1, 0]
+    assert "no plan runs" in caplog.text
+
+
 def _omegas(documents):
     for event in _events(documents):
         with Capture(event["capture_file"]) as capture:
