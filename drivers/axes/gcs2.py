@@ -63,8 +63,8 @@ def read_identity(text: str) -> tuple[str, str, str, str]:
     ``(c)2013 Physik Instrumente(PI) Karlsruhe, E-861 Version 7.2.0``.
     """
     parts = [part.strip() for part in text.split(",")]
-    if len(parts) == 4:
-        return parts[0], parts[1], parts[2], parts[3]
+    if len(parts) >= 4:
+        return parts[0], parts[1], parts[2], ", ".join(parts[3:])
     model = re.search(r"\b[A-Z]-\d{3}[\w.]*", text)
     firmware = re.search(r"version\s+(\S+)", text, re.IGNORECASE)
     return text.strip(), model[0] if model else "", "", firmware[1] if firmware else ""

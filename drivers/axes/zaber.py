@@ -54,7 +54,7 @@ FLAGS = {
     "NI": "movement interrupted",
     "NC": "manual control",
 }
-_REPLY = re.compile(r"@(\d\d) (\d) (\d\d) (OK|RJ) (IDLE|BUSY) (--|[A-Z0-9]{2}) ([^:]*)(?::([0-9A-F]{2}))?")
+_REPLY = re.compile(r"@(\d\d) (\d) (\d\d) (OK|RJ) (IDLE|BUSY) (--|[A-Z0-9]{2}) ([^:]*)(?::([0-9A-Fa-f]{2}))?")
 
 
 class Config(AxisConfig):
@@ -95,12 +95,12 @@ def checksum(text: str) -> str:
 
 def parse_reply(frame: bytes) -> Reply | None:
     """Read a reply line; None if it is not a whole reply, or its checksum is wrong."""
-    text = frame.decode("ascii", "replace")
+    text = frame.decode("ascii", "replace").rstrip()
     match = _REPLY.fullmatch(text)
     if match is None:
         return None
     summed = match[8] is not None
-    if summed and checksum(text[1:-3].replace("\ufffd", "?")) != match[8]:
+    if summed and checksum(text[1:-3].replace("\ufffd", "?")) != match[8].upper():
         return None
     numbers = int(match[1]), int(match[2]), int(match[3])
     return Reply(*numbers, match[4] == "OK", match[5] == "BUSY", match[6], match[7], summed)
@@ -115,6 +115,8 @@ class ZaberLine(ControllerLine):
         self._message_ids = itertools.cycle(range(1, 100))
         # Devices set to answer without checksums (`comm.checksum` 0). From others such a reply is a damaged one.
         self._unsummed: set[int] = set()
+        #: What came after the last question to all devices.
+        self.heard: list[bytes] = []
 
     def send(self, address: int, axis: int, words: str) -> int:
         """Write a command and return its message id; takes no lock."""
@@ -171,10 +173,12 @@ class ZaberLine(ControllerLine):
     def ask_all(self, words: str, quiet_s: float = 0.1) -> list[tuple[int, str]]:
         """Ask every device on the chain; returns addresses and data of the replies until the line is quiet."""
         replies: list[Reply] = []
+        self.heard.clear()
         with self.link.lock:
             message_id = self.send(0, 0, words)
             deadline_s = self.link.clock.now_s() + self.reply_s
             while (frame := self.link.read_frame(deadline_s)) is not None:
+                self.heard.append(frame)
                 reply = parse_reply(frame)
                 if reply is not None and reply.message_id == message_id and reply.accepted:
                     replies.append(reply)
@@ -239,6 +243,12 @@ class ZaberAxis(MotionAxis):
         devices = agreed(ask) or agreed(ask)
         listing = ", ".join(f"address {address}: serial {serial}" for address, serial in devices)
         request = f"axis {self.name}, find Zaber device on {config.port}"
+        if not devices and self._line.heard:
+            raise ReplyError(
+                request,
+                f"no valid reply, but {self._line.heard[:3]}",
+                "Check baudrate, and that the chain speaks Zaber ASCII with message ids",
+            )
         if not devices:
             raise ReplyTimeout(request, "no device answers", "Check power, cable and that the chain speaks Zaber ASCII")
         if len({address for address, _ in devices}) < len(devices):

@@ -230,6 +230,7 @@ def test_readings_that_disagree_are_no_position() -> None:
         # The first is what public recordings of an E-861 have.
         ("(c)2013 Physik Instrumente(PI) Karlsruhe, E-861 Version 7.2.0", ("E-861", "", "7.2.0")),
         ("Physik Instrumente, C-863.11, 0115012345, 1.2.1.0", ("C-863.11", "0115012345", "1.2.1.0")),
+        ("(c)2017 Physik Instrumente, C-887, 0115012345, 2.6.1, 1.0", ("C-887", "0115012345", "2.6.1, 1.0")),
         ("PHYSIK INSTRUMENTE C-867 VERSION 1.0", ("C-867", "", "1.0")),
         ("(c)2015 Physik Instrumente (PI) GmbH", ("", "", "")),
     ],
@@ -259,9 +260,11 @@ def summed(body: str) -> bytes:
 
 def test_zaber_exchange_sorts_out_what_is_not_its_reply() -> None:
     old, right = summed("02 1 99 OK IDLE -- 5"), summed("02 1 01 OK IDLE -- -77")
+    checked = summed("02 1 02 OK BUSY WR 0").rpartition(b":")[2]
     with scripted(
         (b"/" + summed("2 1 01 get pos") + b"\n", b"!02 1 IDLE --\r\n#02 1 info\r\n@%b\r\n@%b\r\n" % (old, right)),
-        (b"/" + summed("2 1 02") + b"\n", b"@" + summed("02 1 02 OK BUSY WR 0") + b"\r\n"),
+        # A checksum in lower case, and a blank.
+        (b"/" + summed("2 1 02") + b"\n", b"@02 1 02 OK BUSY WR 0:%b \r\n" % checked.lower()),
         (b"/" + summed("2 1 03 fly") + b"\n", b"@" + summed("02 1 03 RJ IDLE -- BADCOMMAND") + b"\r\n"),
     ) as (path, _):
         line = zaber.ZaberLine(zaber.Config(port=path), patient_clock(), None)
@@ -302,6 +305,14 @@ def test_a_zaber_reply_that_lost_its_checksum_is_not_believed() -> None:
         with pytest.raises(ReplyError):
             line.ask(1, 1, "get pos", repeat=False)
         line.close()
+
+
+def test_a_zaber_that_answers_in_another_form_is_not_called_silent() -> None:
+    emulator = zaber_emulator.make(ServeOptions(clock=FastClock(100.0, base=patient_clock())))
+    reply = emulator._reply
+    emulator._reply = lambda data: reply(data.replace(b" IDLE", b""))  # type: ignore[method-assign]
+    with served(emulator) as (path, lines), pytest.raises(ReplyError, match=r"no valid reply, but \[b'@01 .*baudrate"):
+        zaber.open("psg", zaber.Config(port=path, reply_s=0.2), lines)
 
 
 def test_zaber_homes_at_the_lesser_of_two_speeds() -> None:
