@@ -4,20 +4,11 @@ import socket
 import struct
 
 from simulators.camera.control_channel import CONTROL, HEARTBEAT_MS
-from simulators.camera.event_messages import (
-    CAPABILITY,
-    EVENTS_SUPPORTED,
-    HOST_ADDRESS,
-    HOST_PORT,
-    NUMBER_OF_CHANNELS,
-    RETRIES,
-    TIMEOUT_MS,
-)
 from simulators.camera.genicam.node_tree import REGISTERS, NodeError, NodeTree
 from simulators.camera.genicam.register import RegisterMemory
 
-# Version 1.2; big-endian registers and UTF-8 texts; writing memory, several registers at once, packets again, events.
-_VERSION, _MODE, _CAPABILITY = 0x0001_0002, 0x8000_0001, 0x0000_0007 | EVENTS_SUPPORTED
+# Version 1.2; big-endian registers and UTF-8 texts; writing memory, several registers at once, packets again.
+_VERSION, _MODE, _CAPABILITY = 0x0001_0002, 0x8000_0001, 0x0000_0007
 _ADDRESS, _NETMASK = 0x0024, 0x0034
 _TEXTS = {
     "DeviceVendorName": (0x48, 32),
@@ -53,17 +44,13 @@ def boot(memory: RegisterMemory, address: str, texts: dict[str, str], xml: tuple
         (_ADDRESS, struct.unpack(">I", socket.inet_aton(address))[0]),
         (_NETMASK, 0xFF00_0000),
         (0x0600, 1),
-        (NUMBER_OF_CHANNELS, 1),
+        (0x0900, 0),
         (0x0904, 1),
-        (CAPABILITY, _CAPABILITY),
+        (0x0934, _CAPABILITY),
         (HEARTBEAT_MS, 3000),
         (0x093C, _TICKS_PER_S >> 32),
         (0x0940, _TICKS_PER_S & 0xFFFF_FFFF),
         (CONTROL, 0),
-        (HOST_PORT, 0),
-        (HOST_ADDRESS, 0),
-        (TIMEOUT_MS, 0),
-        (RETRIES, 0),
         (0x0D00, 0),
         (0x0D04, 1500),
         (0x0D18, 0),

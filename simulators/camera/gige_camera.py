@@ -1,7 +1,7 @@
 """A simulated GigE Vision camera on loopback: it serves a GenICam description and does what its features say.
 
 Registers are memory; a few features act, by their standard (SFNC) names: region, pixel format, exposure, gain,
-triggers, acquisition, status, events, time stamps behind the image. A program can set and read back all others.
+triggers, acquisition, status, time stamps behind the image. A program can set and read back all others.
 Its pixels come from a Python function that is called at each exposure, in a thread of the camera.
 
 One camera occupies one address. A second one at the same time needs a second loopback address, which root adds
@@ -19,7 +19,6 @@ from drivers.errors import CameraError
 from drivers.pixel_formats import pixel_format_of
 from simulators.camera.bootstrap import MOST_XML_BYTES, boot, free_address
 from simulators.camera.control_channel import ControlChannel
-from simulators.camera.event_messages import EventMessages, Moment
 from simulators.camera.exposure import PixelSource, counts_of
 from simulators.camera.frame_packets import PACKET_SIZE, FramePackets, send, send_test_packet, with_chunks
 from simulators.camera.genicam.features import LOADS, START, STOP, TRIGGER, FeatureValues
@@ -121,7 +120,6 @@ class GigeCamera:
         self._wake = threading.Condition(self._lock)
         self._channel = ControlChannel(self)
         self._worker: threading.Thread | None = None
-        self._events: EventMessages | None = None
         self._was_on = self._plugged_in = self._acquiring = self._triggered = self._busy = False
         # Which start of the acquisition this is: an exposure of an earlier one is thrown away.
         self._run_number = 0
@@ -177,7 +175,6 @@ class GigeCamera:
         self._plugged_in = self._was_on = True
         xml = (self._description.name, self._xml_at, len(self._description.served))
         boot(self._memory, self.address, self._texts, xml)
-        self._events = EventMessages(self._bootstrap)
         try:
             self._channel.open(self.address)
         except OSError as error:
@@ -197,8 +194,6 @@ class GigeCamera:
             self._plugged_in = False
             self._begin(acquiring=False)
         self._channel.close()
-        if self._events is not None:
-            self._events.close()
         worker, self._worker = self._worker, None
         if worker is not None:
             worker.join()
@@ -302,17 +297,11 @@ class GigeCamera:
                 return
             if self._busy or self._triggered or time.monotonic() < self._armed_at_s:
                 self.ignored_triggers += 1
-                self._tell("missed", 0)
                 return
             self._triggered, self.triggered_s = True, time.monotonic()
             # Before the command is answered: the status then is "exposing".
             self._features.show(exposing=True, armed=False)
             self._wake.notify_all()
-
-    def _tell(self, moment: Moment, frame_id: int) -> None:
-        if self._events is not None:
-            for number in self._features.events(moment):
-                self._events.tell(self.address, number, frame_id, time.time_ns())
 
     def _run(self) -> None:
         while self._plugged_in:
@@ -334,7 +323,6 @@ class GigeCamera:
             if self._run_number == run_number:
                 self._armed_at_s = time.monotonic() + self._arming_s
                 self._features.show(exposing=False, armed=not self._arming_s)
-                self._tell("ended", self._frame_id)
         if frame is not None:
             time.sleep(hold_back_s)
             self.sent.append(frame)
@@ -372,7 +360,6 @@ class GigeCamera:
             info = exposed(self._features, self._features.info(self._frame_id))
             self._wake.wait_for(lambda: self._run_number != run_number, delay_s(self._features))
             start_s, time_ns = time.monotonic(), time.time_ns()
-            self._tell("started", info.frame_id)
         counts = counts_of(self._source, info, fmt, self.bits)
         with self._lock:
             counts = processed(self._features, info, counts, fmt.bits)

@@ -21,9 +21,8 @@ SOFTWARE_TRIGGER, TRIGGER_ARMED = 0x30C, 0x4038
 GAIN_RAW, BLACK_LEVEL_RAW, FRAME_RATE_ENABLE, PTP_ENABLE, PTP_STATUS = 0x4040, 0x4044, 0x4048, 0x404C, 0x4050
 PACKET_DELAY = 0x4054
 CHUNK_MODE, CHUNK_TIMESTAMP_ENABLE = 0x4058, 0x405C
-# One for each status of the table, and one for each event.
+# One for each status of the table.
 STATUS = 0x4060
-EVENT_NOTIFICATION = 0x4080
 # Behind the image: its number and length, and a time stamp of 8 bytes with the same.
 CHUNK_BYTES = 8 + 8 + 8
 TIMESTAMP_CHUNK = 0xFF5A0001
@@ -145,7 +144,6 @@ def description(table: NodeMap, width: int, height: int) -> str:
         *_light(table),
         *_clock(table),
         *_chunks(table),
-        *_events(table),
         _integer("GevSCPD", PACKET_DELAY, 0, 1_000_000),
         _payload_size(table),
     ]
@@ -265,20 +263,6 @@ def _clock(table: NodeMap) -> list[str]:
     status = "PtpStatus" if table.ptp == "PtpEnable" else "GevIEEE1588Status"
     states = {"Disabled": 0, "Listening": 1, "Slave": 2, "Master": 3}
     return [_flag(table.ptp, PTP_ENABLE), _choice(status, PTP_STATUS, states)]
-
-
-def _events(table: NodeMap) -> list[str]:
-    if not table.events:
-        return []
-    index = '<pIndex Offset="0x4">EventSelectorValue</pIndex>'
-    return [
-        _selector("EventSelector", list(table.events)),
-        _choice("EventNotification", EVENT_NOTIFICATION, {"Off": 0, "On": 1}, index),
-        *(
-            f'<Integer Name="Event{name}" NameSpace="Standard"><Value>{number}</Value></Integer>'
-            for name, number in table.events.items()
-        ),
-    ]
 
 
 def _payload_size(table: NodeMap) -> str:

@@ -44,7 +44,6 @@ class NodeMap(Section):
     gamma: Literal["GammaEnable", "Gamma"] | None = Field(default=None, description="how it is switched")
     frame_rate: Literal["AcquisitionFrameRateEnable"] | None = None
     chunk_timestamp: bool = Field(default=False, description="it can send the time of the exposure behind the image")
-    events: dict[str, int] = Field(default={}, description="numbers of the events that it can tell, by name")
     ptp: Literal["PtpEnable", "GevIEEE1588"] | None = Field(default=None, description="feature that switches it on")
 
     def codes(self) -> dict[str, int]:

@@ -5,7 +5,6 @@ import math
 from collections.abc import Iterator, Sequence
 
 from drivers.genicam import BLACK_LEVEL, GAIN_DB, GAIN_RAW, gain_unit
-from simulators.camera.event_messages import EVENTS, Moment
 from simulators.camera.exposure import ExposureInfo
 from simulators.camera.genicam.formula import Number
 from simulators.camera.genicam.node_tree import REGISTERS, NodeError, NodeTree
@@ -144,18 +143,6 @@ class FeatureValues:
             if self._nodes.chosen("TriggerMode") == "Off":
                 return None
             return self._nodes.chosen("TriggerSource")
-
-    def events(self, moment: Moment) -> list[int]:
-        """Numbers of the events of a moment that a host has asked for."""
-        nodes, selector, switch = self._nodes, "EventSelector", "EventNotification"
-        numbers = []
-        for name in EVENTS[moment] if self._is_available(selector) and self._is_available(switch) else ():
-            if name in nodes.entries(selector) and f"Event{name}" in nodes:
-                with nodes.assuming(selector, name):
-                    # Makers have several words for on.
-                    if nodes.chosen(switch) != "Off":
-                        numbers.append(int(nodes.value(f"Event{name}")))
-        return numbers
 
     def time_chunk(self, time_ns: int) -> dict[int, bytes] | None:
         """The chunk with the time of an exposure, by its number; empty if it is not enabled, None without chunks."""
