@@ -17,7 +17,7 @@ from drivers.errors import CameraError, CameraLost, SettingRefused, ignore_refus
 from drivers.genicam import EXPOSURE_US, Features
 
 # What makers call an enumeration's entry that switches something off.
-_OFF_WORDS = ("Off", "None", "Disabled", "Disable", "False", "No", "Normal", "Standard", "Linear", "LiveVideo")
+_OFF_WORDS = ("Off", "None", "Disable", "False", "No", "Normal", "Standard", "Linear", "LiveVideo", "Manual")
 _OFF_ENDS = ("off", "none", "disabled", "notest", "nopattern")
 # Some cameras go on loading after they have answered.
 _LOAD_S = 2.0

@@ -18,7 +18,7 @@ _SEQUENCERS = ("SequencerMode", "SequenceEnable", "pgrHDRModeEnabled", "HDR_Mode
 _TABLES = ("LUTEnable", "ContrastEnable", "BslContrastMode", "ContrastMode")
 _FILTERS = ("SharpeningEnable", "SharpnessEnabled", "DenoisingEnable", "MedianFilter", "EdgeFilter", "ConvolutionMode")
 _DELAYS = ("TriggerDelay", "TriggerDelayAbs", "FrameStartTriggerDelay", "TrigDelay")
-_OFF = ("Off", "None", "Disabled", "Linear", "linear", "Normal", "NoTest")
+_OFF = ("Off", "None", "Disabled", "Linear", "linear", "Normal", "NoTest", "Manual")
 
 
 class Settings(Protocol):

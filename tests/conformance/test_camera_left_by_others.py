@@ -108,6 +108,7 @@ def test_a_delay_under_a_name_of_the_maker_is_waited_for_or_refused(bench_camera
         ("SequencerMode", ("SequencerOn", "SequencerOff")),
         ("AutoExposure", ("On", "Off")),
         ("LUTMode", ("Table", "Off")),
+        ("ExposureAuto", ("Auto", "Manual")),
     ],
 )
 def test_a_mode_that_spoils_frames_is_off_or_the_capture_is_refused(
