@@ -260,11 +260,11 @@ def summed(body: str) -> bytes:
 
 def test_zaber_exchange_sorts_out_what_is_not_its_reply() -> None:
     old, right = summed("02 1 99 OK IDLE -- 5"), summed("02 1 01 OK IDLE -- -77")
-    checked = summed("02 1 02 OK BUSY WR 0").rpartition(b":")[2]
+    checked = summed("02 1 02 OK BUSY WR 06").rpartition(b":")[2]
     with scripted(
         (b"/" + summed("2 1 01 get pos") + b"\n", b"!02 1 IDLE --\r\n#02 1 info\r\n@%b\r\n@%b\r\n" % (old, right)),
         # A checksum in lower case, and a blank.
-        (b"/" + summed("2 1 02") + b"\n", b"@02 1 02 OK BUSY WR 0:%b \r\n" % checked.lower()),
+        (b"/" + summed("2 1 02") + b"\n", b"@02 1 02 OK BUSY WR 06:%b \r\n" % checked.lower()),
         (b"/" + summed("2 1 03 fly") + b"\n", b"@" + summed("02 1 03 RJ IDLE -- BADCOMMAND") + b"\r\n"),
     ) as (path, _):
         line = zaber.ZaberLine(zaber.Config(port=path), patient_clock(), None)
