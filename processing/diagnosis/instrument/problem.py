@@ -9,10 +9,11 @@ of the counts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
+from itertools import accumulate
 
 import numpy as np
 
@@ -398,10 +399,33 @@ class InstrumentProblem:
 
     def slopes(self, k: int, space: Space, values: Array, a: Array, *, columns: Columns) -> Array:
         """Derivatives (values, ..., L, K) of the rows a (..., L, K) of a capture, which `columns` makes of changes."""
-        conditions = self.captures[k].conditions
-        return slopes_of_rows(
-            partial(self.changes, k, space), self.models[k], conditions, space, values=values, a=a, columns=columns
-        )
+        conditions, changes = self.captures[k].conditions, self._changes_about(k, space, values)
+        return slopes_of_rows(changes, self.models[k], conditions, space, values=values, a=a, columns=columns)
+
+    def _changes_about(self, k: int, space: Space, values: Array) -> Callable[[Array], Changes]:
+        """Changes of values of which those of one candidate differ: all before it and behind it are joined once."""
+        none = Changes(self.captures[k].conditions)
+
+        def joined(*parts: Changes) -> Changes:
+            total = Changes(none.conditions, built=self._built[k])
+            for part in parts:
+                if part is not none:
+                    total.add(part)
+            return total
+
+        pairs = space.pairs
+        each = [self._changes_of(k, c, values[p]) if values[p].any() else none for c, p in pairs]
+        before = list(accumulate([self._changes_of(k, None, np.zeros(0)), *each], joined))
+        behind = list(accumulate([none, *reversed(each)], lambda later, part: joined(part, later)))[::-1]
+
+        def changes(moved: Array) -> Changes:
+            differ = np.flatnonzero(moved != values)
+            if not differ.size:
+                return joined(before[-1])
+            i = space.owner(int(differ[0]))
+            return joined(before[i], self._changes_of(k, pairs[i][0], moved[pairs[i][1]]), behind[i + 1])
+
+        return changes
 
     def slopes_of_counts(self, k: int, space: Space, values: Array, c: Array) -> Array:
         """Derivatives (values, F, L) of the coefficients c (F, L) of the corrected counts of a capture."""

@@ -134,6 +134,10 @@ class Space:
         """Candidates, each with where its values stand in the common vector."""
         return list(zip(self.candidates, self.slices, strict=True))
 
+    def owner(self, position: int) -> int:
+        """Number of the candidate that a value of the common vector belongs to."""
+        return int(self._owner[position])
+
     def other_than_zero(self, values: Array) -> Iterator[tuple[Candidate, Array]]:
         """Candidates of which a value is not zero, each with its values, of the common vector (K,)."""
         for k in np.unique(self._owner[np.flatnonzero(values)]):
