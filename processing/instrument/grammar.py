@@ -25,7 +25,7 @@ OF_A_HARMONIC = 0.5
 OF_A_PART = 2.0
 #: [sizes] Bounds of every value.
 REACH = 20.0
-#: [degree] Turn of an element from which on harmonics of its angle are more than a slope.
+#: [degree] Phase of a wave from which on it is more than a slope.
 LEAST_TURN_DEG = 180.0
 #: [states] From which on a course over time is one.
 FEWEST_STATES = 7
@@ -47,7 +47,9 @@ OF_A_PLATE = (
 #: Parts of what one mechanism does to a plate: it is tilted, or light of another kind or direction passes it too.
 TOGETHER = ("azimuth", "retardance", "circular retardance", "depolarization")
 TOGETHER_TURNING = ("gain", "azimuth", "retardance", "diattenuation")
-#: Quantities of the way between the trains.
+#: Behind the generator train, and between the analyzer train and the elements of the channels.
+PATHS = ("path", "exit")
+#: Quantities of a path.
 OF_THE_PATH = (
     ("retardance at 0 degrees", "retardance at 45 degrees"),
     ("circular retardance",),
@@ -234,9 +236,9 @@ def _add(changes: Changes, model: InstrumentModel, site: str, quantity: str, *, 
 
 def _bend(changes: Changes, model: InstrumentModel, site: str, quantity: str, *, value: Array) -> None:
     """A Mueller matrix beside an element: behind it on the way to the sample, before it on the way from there."""
-    if site == "path":
-        element, angle, behind = model.generator[-1].name, np.zeros(value.shape), True
-        changes.follow(element, _exponential(value[:, None, None] * GENERATORS[quantity]))
+    if site in PATHS:
+        last = (model.generator if site == "path" else model.analyzer)[-1]
+        changes.follow(last.name, _exponential(value[:, None, None] * GENERATORS[quantity]))
         return
     element = site
     part = next(e for e in model.elements() if e.name == element)
@@ -262,19 +264,24 @@ def _exponential(a: Array) -> Array:
 
 def sentences(model: InstrumentModel, conditions: Conditions) -> tuple[Sentence, ...]:
     """All sentences about an instrument in these conditions, without the effects that have names."""
-    turning = [axis for axis in model.axes if _turns(conditions, axis)]
+    turning = {axis: _turn_deg(conditions, axis) for axis in model.axes}
     times = TIMES if conditions.states >= FEWEST_STATES else ()
     result: list[Sentence] = []
-    passed: list[str] = []
+    passed: dict[str, float] = {}
     for element in model.generator:
         result += _of_element(element, turning, passed, times, front=True)
     if len(model.generator) > 1:
-        result += _of_path(passed, times)
+        result += _of_path("path", passed, times)
+        result.append(Sentence("path", ("diattenuation", "diattenuation at 45 degrees")))
+        result += [Sentence("sample", ("azimuth",), time) for time in times]
     states = conditions.states if times else 0
     for element in model.analyzer:
         result += _of_element(element, turning, passed, times, front=False)
         if not isinstance(element, Retarder):
             result += _jumps(element.name, "azimuth", states)
+    if states and model.analyzer and any(c.elements for c in model.channels):
+        result += _of_path("exit", passed, times)
+        result.append(Sentence("exit", OF_THE_PATH[0]))
     result += _of_source_and_detector(states, times, turning)
     # Once a turn it has a name.
     result += _waves("image", SHIFT, turning, (2,))
@@ -283,31 +290,36 @@ def sentences(model: InstrumentModel, conditions: Conditions) -> tuple[Sentence,
         result += [Sentence("image", quantities, time) for time in times[:1]]
     if states > 2 * MODES:
         result.append(Sentence("source", ("gain",), "wandering"))
-    return tuple(dict.fromkeys(result))
+    # Where its level in each state is projected out it has any course.
+    return tuple(dict.fromkeys(s for s in result if s.site != "source" or not model.projects_source))
 
 
-def _turns(conditions: Conditions, axis: str) -> bool:
-    """Whether an axis turns so far that harmonics of its angle are more than a slope."""
+def _turn_deg(conditions: Conditions, axis: str) -> float:
+    """Angle through which an axis turns; 0 where it takes no more than two."""
     angle = conditions.angles_deg.get(axis, np.zeros(1))
-    return np.unique(np.round(angle, 3)).size > 2 and float(np.ptp(angle)) > LEAST_TURN_DEG
+    return float(np.ptp(angle)) if np.unique(np.round(angle, 3)).size > 2 else 0.0
 
 
-def _waves(site: str, quantities: tuple[str, ...], axes: Sequence[str], periods: Sequence[int]) -> Iterator[Sentence]:
-    for axis in axes:
+def _waves(
+    site: str, quantities: tuple[str, ...], axes: Mapping[str, float], periods: Sequence[int]
+) -> Iterator[Sentence]:
+    """Sentences about harmonics of axes that turn through so many degrees, where each is more than a slope."""
+    for axis, turn_deg in axes.items():
         for n in periods:
-            yield Sentence(site, quantities, f"by {n} x {axis}")
+            if n * turn_deg > LEAST_TURN_DEG:
+                yield Sentence(site, quantities, f"by {n} x {axis}")
 
 
 def _of_element(
-    element: Element, turning: Sequence[str], passed: list[str], times: Sequence[str], *, front: bool
+    element: Element, turning: Mapping[str, float], passed: dict[str, float], times: Sequence[str], *, front: bool
 ) -> Iterator[Sentence]:
     """Sentences about one element, which may depend on the axes that the light has `passed`, its own included."""
-    name, earlier = element.name, tuple(passed)
-    axes = [element.axis] if element.axis in turning and element.axis else []
-    passed += [axis for axis in axes if axis not in passed]
+    name, earlier = element.name, dict(passed)
+    axes = {element.axis: turning[element.axis]} if element.axis and turning[element.axis] else {}
+    passed |= axes
     if isinstance(element, Retarder):
         yield from _waves(name, ("retardance",), axes, (2, 3, 4))
-        yield from _waves(name, ("retardance",), earlier if not front else (), (1, 2))
+        yield from _waves(name, ("retardance",), earlier if not front else {}, (1, 2))
         yield from _waves(name, ("azimuth",), axes, (3, 4))
         yield from _waves("source", ("gain",), axes, (3, 4))
         yield from _waves(name, ("diattenuation",), axes, (1, 2))
@@ -317,19 +329,18 @@ def _of_element(
             yield from (Sentence(name, (quantity,)) for quantity in OF_A_PLATE)
             yield from (Sentence(name, (q,), time) for time in times[1:] for q in ("azimuth", "retardance"))
     else:
-        yield from _waves(name, ("azimuth",), earlier if not front else (), (1, 2))
+        yield from _waves(name, ("azimuth",), earlier if not front else {}, (1, 2))
         yield from (Sentence(name, (q,), time) for time in times for q in ("azimuth", "retardance at 45 degrees"))
         if not front:
             yield Sentence(name, ("retardance at 45 degrees",))
 
 
-def _of_path(passed: Sequence[str], times: Sequence[str]) -> Iterator[Sentence]:
-    """Sentences about the path between the trains, and about the sample."""
-    for quantities in OF_THE_PATH:
-        yield from _waves("path", quantities, passed, (1, 2))
-        yield from (Sentence("path", quantities, time) for time in times)
-    yield Sentence("path", ("diattenuation", "diattenuation at 45 degrees"))
-    yield from (Sentence("sample", ("azimuth",), time) for time in times)
+def _of_path(site: str, passed: Mapping[str, float], times: Sequence[str]) -> Iterator[Sentence]:
+    """Sentences about a path behind the axes that the light has `passed`."""
+    at_exit = site == "exit"
+    for quantities in (*OF_THE_PATH, ("circular diattenuation",)) if at_exit else OF_THE_PATH:
+        yield from _waves(site, quantities, passed, (1, 2, 4) if at_exit else (1, 2))
+        yield from (Sentence(site, quantities, time) for time in times)
 
 
 def _jumps(site: str, quantity: str, states: int) -> Iterator[Sentence]:
@@ -342,7 +353,7 @@ def _beats(states: int) -> Array:
     return np.arange(1.5, states / 2, 0.5)
 
 
-def _of_source_and_detector(states: int, times: Sequence[str], turning: Sequence[str]) -> Iterator[Sentence]:
+def _of_source_and_detector(states: int, times: Sequence[str], turning: Mapping[str, float]) -> Iterator[Sentence]:
     yield from (Sentence("source", ("gain",), time) for time in times[1:])
     yield from _jumps("source", "gain", states)
     yield from (Sentence("source", ("gain",), f"beating {n:g} times") for n in _beats(states))

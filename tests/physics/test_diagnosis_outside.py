@@ -15,6 +15,9 @@ from processing.instrument.grammar import parse_sentence
 from processing.instrument.grammar import sentences as sentences_of
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.schema import Sample
+from processing.storage.formats.import_request import ImportRequest
+from processing.storage.formats.importing import import_capture
+from processing.yaml_file import dump_yaml
 from simulators.blind.outside_list import ghost, image_lag, lamp_jump
 from simulators.blind.real_bench import RoundSample
 from simulators.blind.undeclared_captures import (
@@ -124,6 +127,39 @@ def test_a_black_level_that_drifts_is_no_bent_response(configs, tmp_path, bench)
     diagnosis = diagnosed(tmp_path, configs, bench, drift_counts=200)
     assert not sure(diagnosis)
     assert sentences(diagnosis) == ["offset of detector over time"]
+
+
+@pytest.mark.parametrize(
+    ("sentence", "values"),
+    [
+        ("diattenuation and diattenuation at 45 degrees of exit by 4 x hwp", [0.0, 0.004, 0.006, 0.0]),
+        ("retardance at 0 degrees and retardance at 45 degrees of exit", [0.0, 2.0]),
+        ("circular diattenuation of exit over time", [0.02]),
+    ],
+)
+def test_optics_before_a_prism_are_corrected_where_axes_turn_by_a_quarter(configs, tmp_path, sentence, values):
+    """Beams move over a window and over the prism; of two channels only the ratio counts."""
+    file, table = tmp_path / "dual.yaml", tmp_path / "states.csv"
+    model = InstrumentModel.load(configs / "instruments/dual_beam_charis.yaml").with_values(
+        {"image_rotator": {"retardance_deg": 100.0}}
+    )
+    file.write_text(dump_yaml(model.model_copy(update={"calibrate": (), "belongs_to": {}})))
+    model, random = InstrumentModel.load(file), np.random.default_rng(7)
+    turn = np.arange(64) % 8, np.arange(64) // 8
+    angles = {"hwp": 11.25 * turn[0], "image_rotator": 45 + 12.5 * turn[1]}
+    changes = Changes(Conditions.of(angles, ("left", "right")))
+    parse_sentence(sentence).apply(changes, model, np.array(values))
+    light = 1e5 * random.uniform(0.9, 1.1, (64, 1)) * (model.rows(angles, changes) @ np.eye(4).ravel())
+    counts = light + 10 * random.standard_normal(light.shape)
+    rows = np.column_stack([*angles.values(), counts, np.full(64, 10)]).tolist()
+    lines = [f"{n}," + ",".join(map(str, row)) for n, row in enumerate(rows)]
+    table.write_text("\n".join(["state,hwp_deg,image_rotator_deg,channel_left,channel_right,sigma", *lines]))
+    request = ImportRequest(table, tmp_path / "air.h5", 1500, instrument=file, sample=Sample(kind="air"))
+    import_capture(request)
+    diagnosis = diagnose_captures([tmp_path / "air.h5"], model)[0].diagnosis
+    assert not sure(diagnosis)
+    assert sentence in sentences(diagnosis)
+    assert diagnosis.error_after.chi2_reduced < 1.5 < diagnosis.error_before.chi2_reduced
 
 
 def test_every_sentence_is_read_back_from_its_text(configs):

@@ -147,9 +147,7 @@ class WholeBench:
         effect = candidate.effect
         if effect.varies_over_image or effect.is_switch:
             return False
-        if candidate.price and (
-            not self.whole.noise_known or self.whole.holds_out_states or len(set(self.whole.wavelengths_nm)) > 1
-        ):
+        if candidate.price and not self.whole.noise_known:
             return False
         captures = self.whole.captures
         acting = [k for k, c in enumerate(captures) if candidate.acts(k, c.wavelength_nm)]

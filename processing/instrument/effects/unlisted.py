@@ -10,4 +10,4 @@ from processing.instrument.effects._sentence import SentenceEffect
 class Unlisted(SentenceEffect):
     """Values in the unit of the quantity."""
 
-    belongs_to = "mechanics"
+    belongs_to = "dispersion"
