@@ -237,7 +237,9 @@ def xi0_of_partial(
     size = (-1, *image.mask.shape)
     fitted = np.where(image.mask.reshape(-1) & ~np.uint8(Mask.SATURATED), np.nan, image.fitted)
     fitted = fitted.reshape(size)
-    result = estimate(fitted, image.told_variance.reshape(size), image.w, m0)
+    variance = (image.intensity_variance * image.error_ratio).reshape(size)
+    shared = image.w @ image.dark, np.sqrt(image.error_ratio).reshape(size[1:])
+    result = estimate(fitted, variance, image.w, m0, shared=shared)
     facts = _facts(result.xi0, result.xi0_stderr, result.valid, f"two coefficients of {image.facts['determined']}")
     steps = (*image.steps, step)
     with _two_coefficients(

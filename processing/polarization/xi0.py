@@ -56,6 +56,7 @@ def estimate(
     w: ArrayLike,
     m0: ArrayLike,
     *,
+    shared: tuple[Array, Array] | None = None,
     weighted: bool = False,
     max_condition: float = 100.0,
     max_stderr: float = 0.1,
@@ -68,6 +69,8 @@ def estimate(
     variance : (K, ...) or None, of the intensities (shot and read noise), same unit squared.
     w : (K, 16), measurement matrix, rows kron(a, g). For a mosaic under one generator state, its 4 channels.
     m0 : (..., 4, 4), dominant Mueller-Jones matrix with element 00 equal to 1; NaN outside the object.
+    shared : (K, D), what each of D independent errors that all share adds to the intensities, and (...) the standard
+        error of each pixel in that unit.
     weighted : weigh by 1/variance; else equal weights as in Jarecki and Kupinski, with the variance propagated.
     max_condition, max_stderr : limits of the validity mask, the second on the error that xi0 would have at 1/4.
 
@@ -87,10 +90,12 @@ def estimate(
         raise ValueError("weights need a variance")
 
     require_mueller_jones(model)
-    sums = _Sums(p.shape[1:])
+    common, unit = shared or (np.zeros((len(rows), 0)), np.ones(()))
+    sums = _Sums(p.shape[1:], common.shape[1])
     for k, row in enumerate(rows):
         vk = None if v is None else np.asarray(v[k], dtype=float)
-        sums.add(np.asarray(p[k], dtype=float), model @ row, row[0], vk, weighted=weighted)
+        sums.add(np.asarray(p[k], dtype=float), model @ row, row[0], vk, common[k], weighted=weighted)
+    sums.c *= unit
     return sums.solve(len(rows), max_condition, max_stderr)
 
 
@@ -115,16 +120,18 @@ def require_mueller_jones(m0: Array) -> None:
 class _Sums:
     """Normal equations of one fit a pixel, accumulated over the measurements."""
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
+    def __init__(self, shape: tuple[int, ...], common: int) -> None:
         zero = np.zeros(shape)
         # Phi^T V Phi (s), unweighted gram (g), Phi^T C Phi of the sandwich (t), Phi^T V P (b).
         self.s, self.g, self.t = ([zero.copy() for _ in range(3)] for _ in range(3))
         self.b = [zero.copy() for _ in range(2)]
+        # Phi^T V times what the measurements share.
+        self.c = np.zeros((2, common, *shape))
         self.square = zero.copy()
         self.scaled = False
         self.have_variance = False
 
-    def add(self, p: Array, p0: Array, pid: float, v: Array | None, *, weighted: bool) -> None:
+    def add(self, p: Array, p0: Array, pid: float, v: Array | None, common: Array, *, weighted: bool) -> None:
         self.have_variance = v is not None
         weight = 1.0 / v if weighted and v is not None else np.ones(())
         spread = weight * weight * v if v is not None else weight
@@ -134,6 +141,9 @@ class _Sums:
             self.t[i] += spread * product
         self.b[0] += weight * p0 * p
         self.b[1] += weight * pid * p
+        for d, error in enumerate(common):
+            self.c[0, d] += weight * p0 * error
+            self.c[1, d] += weight * pid * error
         self.square += weight * p * p
         self.scaled = weighted
 
@@ -147,7 +157,8 @@ class _Sums:
             residual = np.maximum(self.square - alpha_0 * self.b[0] - alpha_id * self.b[1], 0.0)
             free = max(count - 2, 0)
             reduced = residual / free if free else np.full_like(a, np.nan)
-            cov = _sandwich(inverse, self.t)
+            spread = [t + (self.c[i] * self.c[j]).sum(axis=0) for t, i, j in zip(self.t, (0, 0, 1), (0, 1, 1), strict=True)]
+            cov = _sandwich(inverse, spread)
             if not self.have_variance:
                 cov = (cov[0] * reduced, cov[1] * reduced, cov[2] * reduced)
             total = alpha_0 + alpha_id

@@ -20,6 +20,8 @@ SAME_EXPOSURE = 1e-3
 UNSEEN_COUNTS = 0.5
 #: Excess of the darks' noise over the noise model that is believed, in standard errors.
 BELIEVED = 3.0
+#: Median of the magnitude of a normal number of unit variance.
+NORMAL_MEDIAN = 0.6745
 
 
 @dataclass(frozen=True)
@@ -98,9 +100,15 @@ class Black:
         return np.asarray(np.tensordot(self.weights(exposure_s)[0], self.means, axes=1), dtype=np.float32)
 
     def mean_variance(self, noise: NoiseModel | None) -> Array:
-        """Variance (D,), counts^2, of each of `means`; 0 for a declared level and without a noise model."""
-        if noise is None or not self.measured:
+        """Variance (D,), counts^2, of each of `means`; 0 for a declared level.
+
+        Without a noise model from the scatter of the dark states. One alone has that of its neighbouring pixels, which
+        also contains a fixed pattern of the sensor.
+        """
+        if not self.measured:
             return np.zeros(len(self.exposure_s))
+        if noise is None:
+            return np.where(self.states > 1, self.scatter / self.states, _neighbour_variance(self.means))
         repeats = self.frames / self.states
         return noise.averaged_floor(repeats, self._excess(noise)) / self.states
 
@@ -193,6 +201,16 @@ def _mean_of(capture: Capture, states: NDArray[np.int64]) -> tuple[NDArray[np.fl
         each.append((sums[2] - sums[1] ** 2 / sums[0]) / sums[0] if sums[0] else float("nan"))
     scatter = float(np.mean(each)) * n / (n - 1)
     return mean.astype(np.float32), scatter, scatter * float(np.sqrt(2 / ((n - 1) * mean.size)))
+
+
+def _neighbour_variance(images: NDArray[np.float32]) -> Array:
+    """Variance (D,) of a pixel of images (D, channels, rows, columns) by the median difference of neighbours.
+
+    They are two columns apart, because the next pixel of a mosaic looks through another filter.
+    """
+    apart = images[..., 2:] - images[..., :-2]
+    flat = np.abs(apart).reshape(len(images), -1).astype(float)
+    return np.square(np.nanmedian(flat, axis=1) / NORMAL_MEDIAN) / 2 if flat.size else np.zeros(len(images))
 
 
 def _seconds(exposure_s: Array) -> str:

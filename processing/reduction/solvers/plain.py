@@ -87,7 +87,8 @@ class MuellerSolver:
             out["residual_rms"][a:b] = np.sqrt(rss / n)
             if self.noise is None:
                 sigma = np.sqrt(rss / free) if dof else np.full(b - a, np.nan, np.float32)
-                out["mueller_errors"][:, a:b] = self.unit_sigma[:, None] * sigma
+                dark = self.black[:16] @ (np.ones((self.black.shape[1], 1), np.float32) if gain is None else gain**2)
+                np.sqrt(np.square(self.unit_sigma[:, None] * sigma) + dark, out=out["mueller_errors"][:, a:b])
                 continue
             variance = self._variance(part, gain, result[square:], self.noise)
             np.sqrt(variance[:16], out=out["mueller_errors"][:, a:b])
@@ -140,14 +141,14 @@ def solve_with_the_sound(
         free = np.maximum(keep.sum(axis=1) - rank - solver.inversion.spent, 0)
         rss = np.sum(residual**2, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
+            unit = np.ones((frames.shape[1], len(part)), np.float32) if gain is None else gain
+            scale = np.asarray(np.broadcast_to(unit[None], raw.shape).reshape(n, -1).T, dtype=float)
+            variance, expected = _expected(solver, solve, keep, y, scale=scale)
             if solver.noise is None:
-                found["mueller_errors"][:, part] = np.sqrt(np.einsum("pin,pin->ip", solve, solve) * (rss / free))
+                variance += np.einsum("pin,pin->ip", solve, solve) * (rss / free)
             else:
-                unit = np.ones((frames.shape[1], len(part)), np.float32) if gain is None else gain
-                scale = np.asarray(np.broadcast_to(unit[None], raw.shape).reshape(n, -1).T, dtype=float)
-                errors, expected = _expected(solver, solve, keep, y, scale=scale)
-                found["mueller_errors"][:, part] = errors
                 found["reduced_chi_square"][part] = np.where(free > 0, rss / expected, np.nan)
+            found["mueller_errors"][:, part] = np.sqrt(variance)
         found["mueller"][:, part] = m.T
         found["residual_rms"][part] = np.sqrt(rss / np.maximum(keep.sum(axis=1), 1))
         found["pixel_flags"][part[ill]] |= np.uint8(Mask.NOT_DETERMINED)
@@ -161,7 +162,9 @@ def _expected(
     *,
     scale: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Standard errors (16, pixels) and expected sum of squared residuals (pixels,) of fits to the states kept.
+    """Variances (16, pixels) and expected sum of squared residuals (pixels,) of fits to the states kept.
+
+    Without a noise model they contain the error of the darks alone.
 
     solve (pixels, 16, N) is each pixel's least-squares matrix, 0 where a state is left out; y and keep (pixels, N);
     scale (pixels, N) is 1 / flat. The residual of least squares is a projection, so noise of variance v leaves the
@@ -186,4 +189,4 @@ def _expected(
             left = (pushed - moved @ w.T) * keep
             least += variance * np.stack([*moved.T**2, np.sum(left**2, axis=1)])
     found = np.maximum(total(slope * y * scale) + least, LEAST * least)
-    return np.sqrt(found[:16]), found[16]
+    return found[:16], found[16]

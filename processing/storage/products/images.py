@@ -235,7 +235,7 @@ class MuellerImage:
         drive, variance = self._sources
         response = drive.T @ g.T.astype(np.float32)
         total = np.einsum("np,np,np->p", response, response, variance)
-        return np.asarray((total * self._error_ratio).reshape(self.mask.shape))
+        return np.asarray((total * self.error_ratio).reshape(self.mask.shape))
 
     def covariance_with(self, gradient: NDArray[np.floating]) -> NDArray[np.float64]:
         """Covariance (rows, columns, 16) of the elements with a quantity of gradient (rows, columns, 16)."""
@@ -244,7 +244,7 @@ class MuellerImage:
             return np.asarray((self._covariance.reshape(-1, 16, 16) @ g[:, :, None]).reshape(gradient.shape))
         drive, variance = self._sources
         covariance = drive @ (variance * (drive.T @ g.T.astype(np.float32)))
-        return np.asarray((covariance * self._error_ratio).T.reshape(gradient.shape), dtype=float)
+        return np.asarray((covariance * self.error_ratio).T.reshape(gradient.shape), dtype=float)
 
     def covariances_between(self, pairs: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
         """Covariances (pairs, pixels) of elements, given by their numbers in row-major order; counts^2."""
@@ -252,7 +252,7 @@ class MuellerImage:
         if self.facts["weighted"]:
             return np.asarray(self._covariance.reshape(-1, 16, 16)[:, first, second].T)
         drive, variance = self._sources
-        return np.asarray((drive[first] * drive[second]) @ variance * self._error_ratio)
+        return np.asarray((drive[first] * drive[second]) @ variance * self.error_ratio)
 
     def product_of(self, form: NDArray[np.float64], gradient: NDArray[np.floating]) -> NDArray[np.float64]:
         """Sum over elements a, b, k of covariance[a, b] form[a, b, k] gradient[k]: (rows, columns).
@@ -269,7 +269,7 @@ class MuellerImage:
         drive, variance = self._sources
         each = np.einsum("an,bn,abk->nk", drive, drive, form, optimize=True)
         total = np.einsum("np,np->p", each.astype(np.float32) @ g.T.astype(np.float32), variance)
-        return np.asarray((total * self._error_ratio).reshape(self.mask.shape))
+        return np.asarray((total * self.error_ratio).reshape(self.mask.shape))
 
     def drawn_noise(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """One draw (16, pixels) of the noise of the elements, counts, with their covariance."""
@@ -278,17 +278,14 @@ class MuellerImage:
             return np.asarray(np.einsum("pij,jp->ip", factor, rng.normal(size=(16, len(factor)))))
         drive, variance = self._sources
         noise = drive @ (np.sqrt(variance) * rng.normal(size=variance.shape))
-        return np.asarray(noise * np.sqrt(self._error_ratio))
-
-    @property
-    def told_variance(self) -> NDArray[np.float64]:
-        """`intensity_variance` (N, pixels) with what dark frames and left-out states add, as the errors hold it."""
-        common = np.square(self.w @ self.dark).sum(axis=1)[:, None]
-        return np.asarray((self.intensity_variance + common) * self._error_ratio)
+        return np.asarray(noise * np.sqrt(self.error_ratio))
 
     @cached_property
-    def _error_ratio(self) -> NDArray[np.float64]:
-        # Flats and left-out states change all errors of a pixel much alike.
+    def error_ratio(self) -> NDArray[np.float64]:
+        """Variance of each pixel's elements (pixels,) over that of intensities and darks alone.
+
+        Flats and left-out states change all errors of a pixel much alike.
+        """
         valid = self.is_determined
         if not valid.any():
             return np.ones(self.mask.size)
@@ -315,8 +312,8 @@ class MuellerImage:
 def difference_errors(images: Sequence[MuellerImage], gradients: Sequence[NDArray[np.floating]]) -> NDArray[np.float64]:
     """Standard errors (rows, columns) of the difference of a quantity of two products of one capture.
 
-    Both come from the same intensities, which they only weigh differently. NaN where that is not known: weighted
-    products, or products of other states.
+    Both come from the same intensities and darks, which they only weigh differently. NaN where that is not known:
+    weighted products, or products of other states.
 
     Parameters
     ----------
@@ -326,8 +323,9 @@ def difference_errors(images: Sequence[MuellerImage], gradients: Sequence[NDArra
     if len(first.w) != len(second.w) or first.facts["weighted"] or second.facts["weighted"]:
         return np.full(first.mask.shape, np.nan)
     a, b = (image._inverse.T @ gradient.reshape(-1, 16).T for image, gradient in zip(images, gradients, strict=True))
-    apart = np.einsum("np,np->p", np.square(a - b), first.told_variance)
-    return np.asarray(np.sqrt(apart).reshape(first.mask.shape))
+    apart = np.einsum("np,np->p", np.square(a - b), first.intensity_variance)
+    apart += np.square((first.w @ first.dark).T @ (a - b)).sum(axis=0)
+    return np.asarray(np.sqrt(apart * first.error_ratio).reshape(first.mask.shape))
 
 
 def element_gradient(image: MuellerImage, element: int) -> NDArray[np.float64]:
