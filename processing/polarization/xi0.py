@@ -157,7 +157,9 @@ class _Sums:
             residual = np.maximum(self.square - alpha_0 * self.b[0] - alpha_id * self.b[1], 0.0)
             free = max(count - 2, 0)
             reduced = residual / free if free else np.full_like(a, np.nan)
-            spread = [t + (self.c[i] * self.c[j]).sum(axis=0) for t, i, j in zip(self.t, (0, 0, 1), (0, 1, 1), strict=True)]
+            first, second = self.c
+            shared = [(a * b).sum(axis=0) for a, b in ((first, first), (first, second), (second, second))]
+            spread = [t + c for t, c in zip(self.t, shared, strict=True)]
             cov = _sandwich(inverse, spread)
             if not self.have_variance:
                 cov = (cov[0] * reduced, cov[1] * reduced, cov[2] * reduced)

@@ -108,9 +108,18 @@ class Black:
         if not self.measured:
             return np.zeros(len(self.exposure_s))
         if noise is None:
-            return np.where(self.states > 1, self.scatter / self.states, _neighbour_variance(self.means))
+            return self._variance_of_means
         repeats = self.frames / self.states
         return noise.averaged_floor(repeats, self._excess(noise)) / self.states
+
+    @property
+    def _variance_of_means(self) -> Array:
+        return np.where(self.states > 1, self.scatter / self.states, _neighbour_variance(self.means))
+
+    @property
+    def frame_variance(self) -> float:
+        """Variance of a single dark frame, counts^2, from the dark states; 0 for a declared level."""
+        return float(np.mean(self._variance_of_means * self.frames)) if self.measured else 0.0
 
     def excess(self, noise: NoiseModel | None, exposure_s: ArrayLike) -> Array:
         """Variance of a frame without light in excess of `noise`, counts^2, at each exposure (N,).

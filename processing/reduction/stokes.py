@@ -1,5 +1,6 @@
 """Reduce the frames of a polarization mosaic to a linear Stokes image: S0, S1, S2, DoLP, AoLP with standard errors."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from processing.instrument.applied_effects import changes_at
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
 from processing.polarization.magnitude import directions, interval
+from processing.reduction.black import NORMAL_MEDIAN
 from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import CountsCorrection, capture_changes, counts_correction, references
@@ -136,10 +138,13 @@ def reduce_stokes(
     systematic = _systematic(capture, model, states)
     correction = correction or CountCorrection.of(capture)
     noise = noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
-    merged = merge(capture, states, correction, noise, counts=counts_correction(changes, model), progress=progress)
+    assumed = noise or NoiseModel(1.0, correction.black.frame_variance, 0.0, "black level")
+    merged = merge(capture, states, correction, assumed, counts=counts_correction(changes, model), progress=progress)
     frame = merged.signal
     if response is not None:
         frame = corrected_frame(frame, response, layout, analyzers)
+    if noise is None:
+        merged = with_noise_of_closure(merged, frame, layout, analyzers)
     channels = demosaic(frame, layout, method)
     maps = stokes(channels, analyzers, layout, method, merged=merged, frame=frame)
     planes = PLANES
@@ -182,29 +187,68 @@ def stokes(
 ) -> dict[str, NDArray[Any]]:
     """Stokes planes and their errors from demosaiced channels (4, rows, columns); names as in PLANES.
 
-    `frame` is the mosaic frame that they come from. Without a noise model the variance of a raw pixel is estimated
-    from the closure, one number for the whole image.
+    `frame` is the mosaic frame that they come from.
     """
+    if merged.shot is None or merged.floor is None:
+        raise ValueError("the noise of a merged frame is not known")
     solve = np.asarray(np.linalg.pinv(analyzers), dtype=float)
-    null = np.linalg.svd(analyzers)[0][:, LINEAR]
-    # Scaled so that ideal analyzers give I0 + I90 - I45 - I135.
-    null = null / np.abs(null).max() * np.sign(null[0])
+    null = _null(analyzers)
     s0, s1, s2 = np.tensordot(solve.astype(np.float32), channels, axes=1)
     closure = np.tensordot(null.astype(np.float32), channels, axes=1)
-    if merged.shot is None or merged.floor is None:
-        spread = 1.4826 * np.nanmedian(np.abs(closure - np.nanmedian(closure))) / np.linalg.norm(null)
-        variance = np.full_like(channels, spread**2)
-    else:
-        shot, floor = _by_channel(merged.shot, layout, channels), _by_channel(merged.floor, layout, channels)
-        light = np.maximum(channels, 0.0)
-        variance = shot * light + floor
-        if merged.relative is not None:
-            variance += _by_channel(merged.relative, layout, channels) * light**2
+    shot, floor = _by_channel(merged.shot, layout, channels), _by_channel(merged.floor, layout, channels)
+    light = np.maximum(channels, 0.0)
+    variance = shot * light + floor
+    if merged.relative is not None:
+        variance += _by_channel(merged.relative, layout, channels) * light**2
     covariance = stokes_covariance(variance, layout, method, solve, frame=frame)
     maps = {"s0": s0, "s1": s1, "s2": s2, "closure": closure, "stokes_covariance": covariance}
     maps |= {f"s{k}_errors": np.sqrt(covariance[k]) for k in range(LINEAR)}
     maps |= linear_polarization(s0, s1, s2, covariance)
     return {name: np.asarray(values, dtype=np.float32) for name, values in maps.items()}
+
+
+def _null(analyzers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What of four channels no light explains, (4,): of ideal analyzers I0 + I90 - I45 - I135."""
+    null = np.linalg.svd(analyzers)[0][:, LINEAR]
+    return np.asarray(null / np.abs(null).max() * np.sign(null[0]))
+
+
+def with_noise_of_closure(
+    merged: MergedFrame, frame: NDArray[np.float32], layout: MosaicLayout, analyzers: NDArray[np.float64]
+) -> MergedFrame:
+    """A merged frame with a noise model, from the closure of its super-pixels, where the gain is not known.
+
+    Demosaicing would smooth the closure. In the brighter half of the image it contains the shot noise, beside the noise
+    of the darks. Without darks the other half tells the two apart, unless it is as bright.
+
+    Parameters
+    ----------
+    merged : with the shot noise of a gain of 1.
+    """
+    null, count = _null(analyzers), range(len(layout.channels))
+    cells = np.stack([layout.samples(frame, k) for k in count]).reshape(len(null), -1).astype(float)
+    shot, floor = (
+        np.stack([layout.samples(np.broadcast_to(part, frame.shape), k) for k in count]).reshape(cells.shape)
+        for part in (merged.shot, merged.floor)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        closure, light = null @ cells, cells.sum(axis=0)
+        closure -= np.nanmedian(closure / light) * light
+    by_light, by_floor = null**2 @ (shot * np.maximum(cells, 0)), null**2 @ floor
+    known = np.isfinite(closure)
+    bright = by_light >= np.median(by_light[known])
+
+    def typical(half: NDArray[np.bool_]) -> tuple[float, float]:
+        variance = np.square(np.median(np.abs(closure[half])) / NORMAL_MEDIAN)
+        return float(np.median(by_light[half])), float(variance - np.median(by_floor[half]))
+
+    high, more = typical(known & bright)
+    low, less = typical(known & ~bright) if (known & ~bright).any() else (high, more)
+    slope, read = max(more, 0.0) / high if high > 0 else 0.0, 0.0
+    if not merged.floor.any() and high > 1.5 * low:
+        slope = min(max(more - less, 0.0) / (high - low), slope)
+        read = max(more - slope * high, 0.0) / float(null @ null)
+    return replace(merged, shot=merged.shot * np.float32(slope), floor=merged.floor + np.float32(read), relative=None)
 
 
 def linear_polarization(
@@ -301,7 +345,7 @@ def _facts(
     if any(counts.values()):
         warnings.append(f"of {mask.size} pixels: {in_words(counts)} (pixel_flags says where)")
     if noise is None:
-        warnings.append("the gain is not known: one noise for the whole image, estimated from the channels' closure")
+        warnings.append("the gain is not known: the noise is estimated from the channels' closure")
     # Medians of a ninth of the pixels are plenty.
     some = good.copy()
     if good[::3, ::3].sum() > 1000:
