@@ -18,6 +18,7 @@ from scipy.special import ndtr
 from processing.arrays import Array, RealArray
 from processing.polarization.magnitude import NORMAL_95, directions, interval, sum_of_singular_values
 from processing.polarization.propagation import Derived
+from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.vector_noise import VectorNoise, of_elements, of_slopes
 from processing.reduction.systematic import Systematic
 from processing.storage.products.images import MuellerImage
@@ -63,6 +64,7 @@ RANGES: tuple[tuple[str, tuple[float, float] | tuple[tuple[float, ...], tuple[fl
     ("xi0", (0.25, 1.0)),
     ("coherency_eigenvalues", ((0.25, 0.0, 0.0, 0.0), (1.0, 1 / 2, 1 / 3, 1 / 4))),
     ("eigenvalue_deviation", (-1 / 3, 1 / 3)),
+    *((name, (0.0, 2.0)) for name in PAPER_PAIRS),
     ("_circular", (-1.0, 1.0)),
     *((f"symmetric_d{k}", (-1.0, 1.0)) for k in (1, 2, 3)),
     ("dominant_mueller_jones", (-1.0, 1.0)),

@@ -377,4 +377,6 @@ def _value(name: str, number: _Number, raw: Sequence[float], inputs: Inputs) -> 
         low = number.value - float(np.sqrt((number.value - number.ends[0]) ** 2 + more))
         high = number.value + float(np.sqrt((number.ends[1] - number.value) ** 2 + more))
         low = max(low, 0.0) if number.ends[0] == 0 else low
+        if not np.isfinite(number.value):
+            low, high = number.ends.tolist()
     return replace(mean, low=low, high=high)

@@ -18,6 +18,7 @@ from processing.polarization.magnitude import (
     positive,
     sum_of_singular_values,
 )
+from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.sorted_eigenvalues import OF_MEAN, of_gaps, of_singular_values
 
 PIXELS = 300
@@ -264,6 +265,15 @@ def test_where_m00_is_noise_every_interval_is_everything() -> None:
     for cell in table:
         if cell.quantity not in ("mueller", "dominant_mueller_jones"):
             assert cell.in_95 > 0.93, cell
+
+
+def test_light_between_two_polarizers_may_be_twice_m00() -> None:
+    """Where m00 is noise the intervals ended at 1, and covered 0 % of the pixels of a polarizer along both."""
+    m = 2 * mueller.diattenuator(np.pi / 2, 1.0, 0.0)
+    maps = quantities_block(noisy_image(np.tile(m, (PIXELS, 1, 1)), 2, 5), (), PAPER_PAIRS)
+    for name, true in (("aligned_linear", 2.0), ("crossed_linear", 0.0), ("crossed_circular", 0.5)):
+        low, high = maps[f"{name}_95"]
+        assert np.mean((low <= true) & (true <= high)) > 0.93, name
 
 
 @pytest.mark.parametrize("true", [0.0, 0.3, 1.0, 3.0, 6.0])

@@ -166,3 +166,12 @@ def test_the_command_writes_csv_json_and_a_budget(stated, synthetic_capture, tmp
     assert sum(c["u"] ** 2 for c in means["depolarization_index"]["budget"]) == pytest.approx(float(row["u"]) ** 2)
     wrong = CliRunner().invoke(app, ["mean", str(product), "--budget", "dolp"])
     assert wrong.exit_code != 0
+
+
+def test_what_does_not_exist_in_a_mean_has_its_whole_range(plain, synthetic_capture, tmp_path):
+    """Its interval was NaN to NaN."""
+    product = mueller_product(synthetic_capture, tmp_path, plain, plain, np.random.default_rng(2), "dim", 0.02)
+    pixels = [(slice(0, 1), slice(k, k + 1)) for k in range(12)]
+    means = [v for pixel in pixels for v in mean_of([product], pixel) if v.name == "retardance_deg"]
+    assert any(np.isnan(v.value) for v in means)
+    assert all((v.low, v.high) == (0, 180) for v in means if np.isnan(v.value))
