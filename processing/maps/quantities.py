@@ -46,8 +46,11 @@ from processing.storage.products.images import MuellerImage, require_all_element
 from processing.storage.products.product import LIT_ERRORS, Plane, Product, ProductError, Step, is_lit
 from processing.storage.products.product_writer import ProductWriter
 
-#: Pixels of a block: gradients take 128 bytes a pixel and quantity.
+#: Pixels that are read and written at a time.
 BLOCK_PIXELS = 1 << 14
+#: Pixels that go through all quantities at a time. Gradients take 128 bytes a pixel and quantity: those of more pixels
+#: leave the cache, and the C library returns them to the system and fetches them anew.
+CACHED_PIXELS = 1 << 11
 
 #: Decompositions that are computed only where asked for, because they take seconds for a megapixel.
 EXTRA = ("symmetric", "differential")
@@ -201,8 +204,33 @@ def quantities_block(
     Parameters
     ----------
     moves : (D, 16, rows, columns), what each uncertain input of the instrument does to M; see `moves_of`.
-    by_input : filled with what each does to the n numbers of each map, (n, pixels, D).
+    by_input : of an image of at most `CACHED_PIXELS`: filled with what each does to the n numbers of each map,
+        (n, pixels, D).
     """
+    shape = image.values.shape[2:]
+    size = shape[0] * shape[1]
+    if size <= CACHED_PIXELS:
+        return _cached_block(image, extra, pairs, moves=moves, by_input=by_input)
+    each = None if moves is None else moves.reshape(*moves.shape[:2], size, 1)
+    planes: dict[str, NDArray[Any]] = {}
+    for start in range(0, size, CACHED_PIXELS):
+        part = np.arange(start, min(start + CACHED_PIXELS, size))
+        found = _cached_block(image.at(part), extra, pairs, moves=None if each is None else each[:, :, part])
+        for name, plane in found.items():
+            whole = planes.setdefault(name, np.empty((*plane.shape[:-2], size), plane.dtype))
+            whole[..., part] = plane[..., 0]
+    return {name: plane.reshape(*plane.shape[:-1], *shape) for name, plane in planes.items()}
+
+
+def _cached_block(
+    image: MuellerImage | ExtrapolatedImage,
+    extra: Sequence[str],
+    pairs: Pairs,
+    *,
+    moves: NDArray[np.float64] | None = None,
+    by_input: dict[str, NDArray[Any]] | None = None,
+) -> dict[str, NDArray[Any]]:
+    """As `quantities_block`, of all pixels at once."""
     m = image.matrices.astype(float)
     # Where there is no light an eigenvalue solver only works on noise, slowly.
     lit = np.where(is_lit(image.values[0, 0], image.errors[0, 0])[..., None, None], m, np.nan)

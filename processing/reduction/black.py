@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from processing.arrays import Array
+from processing.instrument.changes import MAD_TO_SIGMA
 from processing.reduction.noise import NoiseModel
 from processing.storage.captures.capture import Capture
 
@@ -20,8 +21,6 @@ SAME_EXPOSURE = 1e-3
 UNSEEN_COUNTS = 0.5
 #: Excess of the darks' noise over the noise model that is believed, in standard errors.
 BELIEVED = 3.0
-#: Median of the magnitude of a normal number of unit variance.
-NORMAL_MEDIAN = 0.6745
 
 
 @dataclass(frozen=True)
@@ -219,7 +218,7 @@ def _neighbour_variance(images: NDArray[np.float32]) -> Array:
     """
     apart = images[..., 2:] - images[..., :-2]
     flat = np.abs(apart).reshape(len(images), -1).astype(float)
-    return np.square(np.nanmedian(flat, axis=1) / NORMAL_MEDIAN) / 2 if flat.size else np.zeros(len(images))
+    return np.square(MAD_TO_SIGMA * np.nanmedian(flat, axis=1)) / 2 if flat.size else np.zeros(len(images))
 
 
 def _seconds(exposure_s: Array) -> str:

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from processing.errors import NotDetermined
 from processing.instrument.applied_effects import changes_at
-from processing.instrument.changes import Changes
+from processing.instrument.changes import MAD_TO_SIGMA, Changes
 from processing.instrument.model import InstrumentModel
 from processing.polarization.magnitude import directions, interval
-from processing.reduction.black import NORMAL_MEDIAN
 from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import CountsCorrection, capture_changes, counts_correction, references
@@ -189,8 +188,6 @@ def stokes(
 
     `frame` is the mosaic frame that they come from.
     """
-    if merged.shot is None or merged.floor is None:
-        raise ValueError("the noise of a merged frame is not known")
     solve = np.asarray(np.linalg.pinv(analyzers), dtype=float)
     null = _null(analyzers)
     s0, s1, s2 = np.tensordot(solve.astype(np.float32), channels, axes=1)
@@ -226,10 +223,9 @@ def with_noise_of_closure(
     merged : with the shot noise of a gain of 1.
     """
     null, count = _null(analyzers), range(len(layout.channels))
-    cells = np.stack([layout.samples(frame, k) for k in count]).reshape(len(null), -1).astype(float)
-    shot, floor = (
-        np.stack([layout.samples(np.broadcast_to(part, frame.shape), k) for k in count]).reshape(cells.shape)
-        for part in (merged.shot, merged.floor)
+    cells, shot, floor = (
+        np.stack([layout.samples(np.broadcast_to(part, frame.shape), k).astype(float).ravel() for k in count])
+        for part in (frame, merged.shot, merged.floor)
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         closure, light = null @ cells, cells.sum(axis=0)
@@ -239,7 +235,7 @@ def with_noise_of_closure(
     bright = by_light >= np.median(by_light[known])
 
     def typical(half: NDArray[np.bool_]) -> tuple[float, float]:
-        variance = np.square(np.median(np.abs(closure[half])) / NORMAL_MEDIAN)
+        variance = np.square(MAD_TO_SIGMA * np.median(np.abs(closure[half])))
         return float(np.median(by_light[half])), float(variance - np.median(by_floor[half]))
 
     high, more = typical(known & bright)

@@ -11,11 +11,13 @@ from typer.testing import CliRunner
 from processing.commands.application import app
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
+from processing.maps import quantities
 from processing.maps.means import mean_of
 from processing.polarization.quantities import depolarization_index
 from processing.reduction.mueller import reduce_mueller
 from processing.reduction.stokes import reduce_stokes
 from processing.storage.captures.capture import Capture
+from processing.storage.products.images import MuellerImage
 from processing.storage.products.product import Product
 
 WHOLE = (slice(0, 32), slice(0, 32))
@@ -175,3 +177,14 @@ def test_what_does_not_exist_in_a_mean_has_its_whole_range(plain, synthetic_capt
     means = [v for pixel in pixels for v in mean_of([product], pixel) if v.name == "retardance_deg"]
     assert any(np.isnan(v.value) for v in means)
     assert all((v.low, v.high) == (0, 180) for v in means if np.isnan(v.value))
+
+
+def test_quantities_of_parts_are_those_of_the_whole_image(plain, synthetic_capture, tmp_path, monkeypatch):
+    product = mueller_product(synthetic_capture, tmp_path, plain, plain, np.random.default_rng(2))
+    image, moves = MuellerImage.load(product), np.random.default_rng(3).normal(size=(2, 16, 32, 32))
+    whole = quantities.quantities_block(image, quantities.EXTRA, {}, moves)
+    monkeypatch.setattr(quantities, "CACHED_PIXELS", 300)
+    parts = quantities.quantities_block(image, quantities.EXTRA, {}, moves)
+    assert list(parts) == list(whole)
+    for name, plane in whole.items():
+        np.testing.assert_allclose(parts[name], plane, rtol=1e-5, atol=1e-6, err_msg=name)

@@ -26,13 +26,13 @@ class MergedFrame:
     mask : (rows, columns), bits of Mask. A pixel is left out of every state of an exposure in one of which it
         saturates (choosing state by state would favour low counts); NOT_DETERMINED where no exposure is left.
     shot, floor, relative : variance of a raw pixel is shot * signal + floor + relative * signal^2, the last part being
-        the error of the flat; each (rows, columns), or (1, 1) where all are alike. None: no noise model, no flat.
+        the error of the flat; each (rows, columns), or (1, 1) where all are alike. None: no flat.
     """
 
     signal: Image
     mask: NDArray[np.uint8]
-    shot: Image | None = None
-    floor: Image | None = None
+    shot: Image
+    floor: Image
     relative: Image | None = None
 
 
@@ -40,7 +40,7 @@ def merge(
     capture: Capture,
     states: NDArray[np.int64],
     correction: CountCorrection,
-    noise: NoiseModel | None,
+    noise: NoiseModel,
     *,
     counts: CountsCorrection | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -89,14 +89,11 @@ def merge(
         total += light
         weight = weight + np.float32(value * len(group)) * keep
         shot = shot + np.float32(np.sum(value / repeats[group])) * keep
-        if noise is not None:
-            floor = floor + np.float32(noise.averaged_floor(repeats[group], excess[group]).sum()) * keep
+        floor = floor + np.float32(noise.averaged_floor(repeats[group], excess[group]).sum()) * keep
         share = share + weights[group].sum(axis=0).astype(np.float32)[:, None, None] * keep
     if correction.bad is not None:
         mask[correction.bad] |= np.uint8(Mask.BAD)
     signal = (total / weight).astype(np.float32)
-    if noise is None:
-        return MergedFrame(signal, mask)
     floor = floor + np.tensordot(correction.black.mean_variance(noise).astype(np.float32), share**2, axes=1)
     scale = np.float32(1) if flat is None else 1 / flat
     return MergedFrame(
