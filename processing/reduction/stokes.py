@@ -244,6 +244,8 @@ def with_noise_of_closure(
     if not merged.floor.any() and high > 1.5 * low:
         slope = min(max(more - less, 0.0) / (high - low), slope)
         read = max(more - slope * high, 0.0) / float(null @ null)
+    # Computed frames have no noise but rounding.
+    slope = max(slope, float(np.finfo(np.float32).eps))
     return replace(merged, shot=merged.shot * np.float32(slope), floor=merged.floor + np.float32(read), relative=None)
 
 
