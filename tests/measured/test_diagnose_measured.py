@@ -1,5 +1,6 @@
 """`diagnose` on real measurements: nothing is set for a data set beyond its train in YAML."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,9 @@ import pytest
 from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.instrument_file import extend_model
+from processing.diagnosis.search.fit import minimize, prior
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 from processing.public_data.conversion import PublicStates, mirror_means, single_detector, tables_of
@@ -93,6 +96,52 @@ def test_the_telescope_at_one_wavelength(public_files, configs, tmp_path):
     # is used is another question: one wavelength tells so little of M that it gets worse by a chance of 0.6 to 4 %.
     residual = next(check.after for check in d.correction.checks if check.name.startswith("rms on held-out data"))
     assert 0.05 < residual < 0.25
+
+
+@pytest.mark.skipif("UMOV_SLOW" not in os.environ, reason="takes ten minutes: UMOV_SLOW=1")
+@pytest.mark.timeout(1800)
+def test_terms_of_even_wavelengths_predict_whole_states_of_odd_ones(public_files, configs, tmp_path):
+    """Terms and their sizes are of the even wavelengths; their values are fitted to four fifths of the odd states."""
+    instrument = configs / "instruments/dual_beam_charis.yaml"
+    model = InstrumentModel.load(instrument)
+    paths = [path for _, path in sorted(telescope(public_files, tmp_path, instrument).items())]
+    found = diagnose_captures(paths[::2], model)[0].solution
+    known: dict[tuple[str, str], list[np.ndarray]] = {}
+    for c, part in found.space.pairs:
+        known.setdefault((c.kind, c.place), []).append(found.weak[part] * c.typical**2)
+    models, data = [], []
+    for path in paths[1::2]:
+        with Capture(path) as capture:
+            models.append(model.nominal_at(capture.header.wavelength_nm))
+            data.append(read_capture(capture, models[-1]))
+    bench = WholeBench(InstrumentProblem(models, data), print)
+    # As the moments of the captures are divided.
+    fold = np.random.default_rng(0).permutation(data[0].conditions.states) % bench.problem.folds
+
+    terms = [c for c in bench.pool if (c.kind, c.place) in known and not (c.effect.per_state or c.effect.is_nominal)]
+    space = Space((*bench.base.candidates, *terms))
+    start, weak = np.zeros(space.size), prior(space)
+    for c, part in space.pairs:
+        if c in bench.base.candidates:
+            start[part] = bench.start[c]
+        elif known[c.kind, c.place][0].size == c.size:
+            weak[part] = np.mean(known[c.kind, c.place], axis=0) / c.typical**2
+    start = minimize(bench.problem, space, start, weak=weak).values
+    error = np.zeros((len(data), fold.size))
+    for f in range(bench.problem.folds):
+        others = [g for g in range(bench.problem.folds) if g != f]
+        values = minimize(bench.problem, space, start, others, weak=weak).values
+        for k, capture in enumerate(bench.problem.captures):
+            told = (bench.problem.rows(k, space, values) @ capture.sample).reshape(-1, 2)
+            seen = capture.signal
+            for c, part in space.pairs:
+                if c.is_pointwise:
+                    seen = c.effect.undo(seen, capture.conditions, c.place, values[part])[0]
+            seen = seen.reshape(-1, 2)
+            ratio = [(i[:, 0] - i[:, 1]) / i.sum(axis=1) for i in (seen, told)]
+            error[k, fold == f] = (ratio[0] - ratio[1])[fold == f]
+    # Rms of (left - right) / (left + right) in states that no fit saw, percent, mean over the wavelengths.
+    assert 0.05 < 100 * np.sqrt((error**2).mean(axis=1)).mean() < 0.15
 
 
 def one_detector(public_files, folder: Path, instrument: Path, wavelength_nm: int, beside: int) -> Path:
