@@ -37,14 +37,18 @@ def means(images: NDArray[np.float32], side: int) -> NDArray[np.float32]:
 
 
 def averaged_for_fits(data: CaptureData) -> CaptureData:
-    """The capture as it is fitted: itself, or means over as small squares of pixels as leave few enough values.
+    """The capture as it is fitted: itself, or means over as small squares of pixels as leave few enough values."""
+    side = side_for(data.signal.size, MOST_FITTED)
+    return averaged(data, side) if side > 1 else data
+
+
+def averaged(data: CaptureData, side: int) -> CaptureData:
+    """Means over squares of so many pixels a side, of a capture of which nothing was undone or moved back yet.
 
     A square counts if all of its pixels do, and is clipped if one of them is. Its neighbours share less noise than
-    those of pixels do, lines more. Nothing was undone or moved back yet.
+    those of pixels do, lines more.
     """
-    side, shared = side_for(data.signal.size, MOST_FITTED), data.shared
-    if side == 1:
-        return data
+    shared = data.shared
     right, down = (mixed_part(part * (1 - part) / side) for part in (shared.right, shared.down))
     return replace(
         data,

@@ -218,15 +218,18 @@ class WholeBench:
                 return [candidate]
         return []
 
+    def _least_unit(self, posterior: Posterior) -> float:
+        """Unit of chi-square with every group there: what varies over the image may be what hides the others."""
+        if not self.whole.noise_known:
+            return posterior.samples.best.unit
+        return min(posterior.samples.best.unit, posterior.sets.settled(everything(posterior.sets)).unit)
+
     def _with_fields(
         self, posterior: Posterior, fixed: Sequence[Candidate], plain: Sequence[Candidate], fields: Sequence[Candidate]
     ) -> Posterior:
         """The posterior of all with values that vary over the image, if they promise something beside the others."""
         space, values = applied(posterior, self.base)
-        unit = posterior.samples.best.unit
-        if self.whole.noise_known:
-            # With every group there: what varies over the image may be what hides the others.
-            unit = min(unit, posterior.sets.settled(everything(posterior.sets)).unit)
+        unit = self._least_unit(posterior)
         joint = Space((*space.candidates, *fields))
         sums = self.whole.sums(joint, np.append(values, np.zeros(joint.size - space.size)))
         parts = dict(joint.pairs)

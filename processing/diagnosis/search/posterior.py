@@ -105,12 +105,7 @@ def fit_posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], st
     samples = stay(sets, likely_starts(sets, state), CHANGES if problem.noise_known else FEWER_CHANGES)
     labels = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(labels) or 'nothing'}; unit of chi-square {state.unit:.3g}")
-    typical, values = space.joined("typical"), mean_over_sets(space, samples, np.ones(space.size))
-    sums = problem.sums(space, values, derivatives=False)
-    if not sets.noise.unit(sums.chi2(problem.noise_known)) <= GROWTH * sets.noise.unit(sets.form.at(values / typical)):
-        # The least certain values lie along a bent valley, in which the straight line to their mean does not stay.
-        values = descend(problem, space, groups, samples, starts=[about], steps=2 * STEPS)
-    return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical), rivals)
+    return _posterior_of(problem, space, members, sets, samples=samples, about=about, rivals=rivals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,3 +222,22 @@ def _settle(problem: Problem, space: Space, first: _Round, look: Look, *, rounds
         now = new
     problem.relinearize(space, now.about)
     return now
+
+
+def _posterior_of(
+    problem: Problem,
+    space: Space,
+    members: tuple[tuple[int, ...], ...],
+    sets: Sets,
+    *,
+    samples: Samples,
+    about: Array,
+    rivals: Mapping[int, tuple[int, ...]],
+) -> Posterior:
+    """The posterior of a problem linearized `about` values (K,)."""
+    typical, values = space.joined("typical"), mean_over_sets(space, samples, np.ones(space.size))
+    sums = problem.sums(space, values, derivatives=False)
+    if not sets.noise.unit(sums.chi2(problem.noise_known)) <= GROWTH * sets.noise.unit(sets.form.at(values / typical)):
+        # The least certain values lie along a bent valley, in which the straight line to their mean does not stay.
+        values = descend(problem, space, sets.groups, samples, starts=[about], steps=2 * STEPS)
+    return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical), rivals)
