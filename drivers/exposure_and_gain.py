@@ -17,6 +17,9 @@ from drivers.genicam import Features
 from drivers.neutral_features import DELAYS, rule_for
 from drivers.pixel_formats import PixelFormat
 
+_UNIT_OF_TIME = re.compile(r"(µ|μ|u|micro|m|milli|n|nano|)\s?s(ec(ond)?s?)?")
+_SCALES = {"m": 1e-3, "milli": 1e-3, "n": 1e-9, "nano": 1e-9, "": 1.0}
+_DECIBEL, _FACTOR = ("db", "decibel", "decibels"), ("x", "factor", "times", "ratio", "fold", "multiplier")
 _RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
 #: Features that switch the control of the frame rate on.
 RATE_CONTROL = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
@@ -29,6 +32,22 @@ _SHORTER = 0.8
 _EXPOSURE_FLOOR_US, _GAIN_FLOOR_DB = 20.0, 0.1
 #: Entries of the selector for a capture's gain; the others are set to their neutral value.
 _WHOLE_GAIN = ("All", "AnalogAll")
+
+
+def _plain(unit: str) -> str:
+    return unit.strip().strip("[]()").lower()
+
+
+def _seconds_of(unit: str) -> float | None:
+    """Seconds of a unit of time: microseconds, which the SFNC has, where there is none; None for another unit."""
+    match = _UNIT_OF_TIME.fullmatch(_plain(unit) or "us")
+    return None if match is None else _SCALES.get(match[1], 1e-6)
+
+
+def gain_unit(unit: str) -> Literal["dB", "factor"] | None:
+    """What the unit of a Gain feature means; None where its description does not say."""
+    word = _plain(unit)
+    return "dB" if word in _DECIBEL else "factor" if word in _FACTOR else None
 
 
 class ExposureAndGain:
@@ -111,11 +130,11 @@ class ExposureAndGain:
 
     def _unit_s(self, name: str) -> float:
         unit = self._features.unit(name)
-        unit_s = None if name.endswith("Raw") and not unit else genicam.seconds_of(unit)
+        unit_s = None if name.endswith("Raw") and not unit else _seconds_of(unit)
         if unit_s is None:
             raise SettingRefused(
                 f"camera {self._name}, a time by {name}",
-                f"it counts in {unit or 'steps of the camera'}, and how long one is stands nowhere",
+                f"it counts in {unit or 'steps'}, and its description does not say how long one is",
                 f"Leave {name} out of `features`, or use a camera that takes times in parts of a second",
             )
         return unit_s
@@ -214,7 +233,7 @@ class ExposureAndGain:
     def _unit_of_gain(self, name: str) -> Literal["dB", "factor"] | None:
         if name in genicam.GAIN_RAW:
             return None
-        return self._gain_unit or genicam.gain_unit(self._features.unit(name))
+        return self._gain_unit or gain_unit(self._features.unit(name))
 
     def _refused(self, gain_db: float, came_back: str) -> SettingRefused:
         return SettingRefused(

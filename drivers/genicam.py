@@ -4,7 +4,6 @@ Cameras accept values that they do not keep: on Aravis' own camera an exposure o
 as 3.57e9. So limits are checked before a value is written, and what is read back decides.
 """
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Literal, TypeVar
@@ -25,27 +24,7 @@ PACKET_DELAY = ("GevSCPD",)
 SERIAL_NUMBER = ("DeviceSerialNumber", "DeviceID")
 FIRMWARE = ("DeviceFirmwareVersion", "DeviceVersion")
 
-_UNIT_OF_TIME = re.compile(r"(µ|μ|u|micro|m|milli|n|nano|)\s?s(ec(ond)?s?)?")
-_SCALES = {"m": 1e-3, "milli": 1e-3, "n": 1e-9, "nano": 1e-9, "": 1.0}
-_DECIBEL, _FACTOR = ("db", "decibel", "decibels"), ("x", "factor", "times", "ratio", "fold", "multiplier")
-
 T = TypeVar("T")
-
-
-def _plain(unit: str) -> str:
-    return unit.strip().strip("[]()").lower()
-
-
-def seconds_of(unit: str) -> float | None:
-    """Seconds of a unit of time: microseconds, which the SFNC has, where there is none; None for another unit."""
-    match = _UNIT_OF_TIME.fullmatch(_plain(unit) or "us")
-    return None if match is None else _SCALES.get(match[1], 1e-6)
-
-
-def gain_unit(unit: str) -> Literal["dB", "factor"] | None:
-    """What the unit of a Gain feature means; None where its description does not say."""
-    word = _plain(unit)
-    return "dB" if word in _DECIBEL else "factor" if word in _FACTOR else None
 
 
 class Features:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from steady_capture import steady_capture
 
-from processing.diagnosis.captures.noise import black_jitter
+from processing.diagnosis.captures.black_jitter import black_jitter
 from processing.reduction.counts_to_signal import CountCorrection
 from processing.reduction.lit_darks import LitDarks
 from processing.storage.captures.capture import Capture

@@ -4,7 +4,8 @@ import contextlib
 import math
 from collections.abc import Iterator, Sequence
 
-from drivers.genicam import BLACK_LEVEL, GAIN_DB, GAIN_RAW, gain_unit
+from drivers.exposure_and_gain import gain_unit
+from drivers.genicam import BLACK_LEVEL, GAIN_DB, GAIN_RAW
 from simulators.camera.exposure import ExposureInfo
 from simulators.camera.genicam.formula import Number
 from simulators.camera.genicam.node_tree import REGISTERS, NodeError, NodeTree
