@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -49,6 +50,16 @@ def test_numpy_is_the_locked_one() -> None:
     locked = (ROOT / "requirements.lock").read_text()
     assert f"numpy=={np.__version__} " in locked
     assert "dist-packages" not in str(np.__file__)
+
+
+def test_who_has_what_the_tests_need_has_what_the_commands_need() -> None:
+    """`./lab` installs nothing more then."""
+    commands, tests = (
+        {*re.findall(r"^[\w.-]+==\S+", (ROOT / name).read_text(), re.M)}
+        for name in ("requirements.lock", "requirements-dev.lock")
+    )
+    assert commands
+    assert commands <= tests
 
 
 @pytest.mark.long
