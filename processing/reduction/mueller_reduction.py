@@ -19,6 +19,7 @@ from processing.reduction.exclusions import Exclusions
 from processing.reduction.facts import determined_words
 from processing.reduction.measurement_matrix import field_of, measurement_matrix
 from processing.reduction.noise import NoiseModel, noise_of
+from processing.reduction.residual_noise import noise_of_residual
 from processing.reduction.sample_states import sample_states
 from processing.reduction.sent_light import PLANES as SENT_PLANES
 from processing.reduction.sent_light import SentLight
@@ -164,6 +165,10 @@ class MuellerReduction:
                 "field_retardance need all of them. Leave them away."
             )
         field = field_of(capture, model, states, changes, level=levels.relative if levels else None)
+        noise = choice.noise or noise_of(capture, states)
+        if noise is None:
+            plain = MuellerSolver(inversion, reader, None)
+            noise = noise_of_residual(plain, choice.solver(plain, field))
 
         def matrix(trial: InstrumentModel) -> tuple[Array, Array]:
             w = source.leveled(measurement_matrix(capture, trial, states, capture_changes(capture, trial, states)))[0]
@@ -183,7 +188,7 @@ class MuellerReduction:
             inversion=inversion,
             levels=levels,
             field=field,
-            noise=choice.noise or noise_of(capture, states),
+            noise=noise,
             choice=choice,
             sent=SentLight.of(inversion),
             systematic=Systematic.of(model, matrix, counts_of, inversion.basis),
@@ -192,7 +197,7 @@ class MuellerReduction:
     @property
     def planes(self) -> dict[str, Plane]:
         """Datasets of the image."""
-        planes = self.choice.planes(known_noise=self.noise is not None)
+        planes = self.choice.planes(known_noise=self.noise is not None and self.noise.own is None)
         planes |= SENT_PLANES if self.sent is not None else {}
         if self.systematic is not None:
             planes |= SYSTEMATIC if self.sent is None else SENT_SYSTEMATIC
@@ -216,7 +221,7 @@ class MuellerReduction:
         planes = self._estimate(solver, frames)
         lost = (planes["pixel_flags"] & LOST) != 0
         if self.sent is not None:
-            planes |= self.sent.planes(planes["mueller"], planes["residual_rms"], solver)
+            planes |= self.sent.planes(planes["mueller"], self._over(planes), solver)
             if self.systematic is not None:
                 planes["stokes_systematic"] = self.systematic.errors(planes["mueller"], self.sent.rows)
                 planes["stokes_systematic"][~self.sent.is_determined] = np.nan
@@ -227,9 +232,19 @@ class MuellerReduction:
 
     def _estimate(self, solver: Solver, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
         planes = solver.solve(frames)
+        if self.noise is not None and self.noise.own:
+            # The error of the darks is common to all states and not in the residual.
+            dark = np.square(solver.dark_errors).sum(axis=1, keepdims=True)
+            own = (np.square(planes["mueller_errors"]) - dark) * self._over(planes)
+            planes["mueller_errors"] = np.sqrt(own + dark)
         if self.levels is not None:
             self.levels.add_errors(planes, self.inversion)
         return planes
+
+    def _over(self, planes: dict[str, NDArray[Any]]) -> Array | float:
+        """Variance of each pixel over that of the line of all of them, as far as its own residual counts."""
+        own = None if self.noise is None else self.noise.own
+        return 1 + own * (planes["reduced_chi_square"] - 1) if own else 1.0
 
     def region(self, capture: Capture, rows: slice, columns: slice) -> tuple[MuellerImage, Array]:
         """A region as an image of one pixel, the mean of those that can be used, and its intensities (N channels,).

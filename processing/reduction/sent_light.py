@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.arrays import BoolArray
+from processing.arrays import Array, BoolArray
 from processing.instrument.determined_basis import ALIKE, determined_elements
 from processing.reduction.solvers.base import Solver
 from processing.reduction.solvers.inversion import Inversion
@@ -70,21 +70,17 @@ class SentLight:
         names = ", ".join(f"S{k}" for k in np.flatnonzero(self.is_determined))
         return f"{names} of the light that the sample sends back (dataset stokes)"
 
-    def planes(self, mueller: NDArray[np.float32], residual_rms: NDArray[np.float32], solver: Solver) -> dict[str, Any]:
-        """Datasets `PLANES` (4, pixels) from the solution of least norm (16, pixels)."""
+    def planes(self, mueller: Array, over: Array | float, solver: Solver) -> dict[str, Any]:
+        """Datasets `PLANES` (4, pixels) from the solution of least norm (16, pixels), its variance times `over`."""
         inversion = solver.inversion
         stokes = (self.rows @ mueller).astype(np.float32)
-        n, dof = inversion.w.shape[0], inversion.free
-        if solver.noise is None:
-            variance = np.tile(residual_rms**2 * n / dof if dof else np.nan, (n, 1))
-        else:
-            floor = solver.intensity_floor[:, None]
-            shot = (solver.noise.slope / solver.repeats)[:, None] * (inversion.w @ mueller)
-            variance = np.maximum(shot + floor, LEAST * floor)
+        floor = solver.intensity_floor[:, None]
+        slope = np.nan if solver.noise is None else solver.noise.slope
+        variance = np.maximum((slope / solver.repeats)[:, None] * (inversion.w @ mueller) + floor, LEAST * floor)
         solve = self.rows @ inversion.pinv
         channels = solver.reader.capture.channels
         drive = np.einsum("knc,nd->kcd", solve.reshape(4, -1, channels), solver.reader.black_weights) ** 2
         dark = (drive @ solver.black_variance).sum(axis=1)
-        errors = np.sqrt(solve**2 @ variance + dark[:, None]).astype(np.float32)
+        errors = np.sqrt(solve**2 @ variance * over + dark[:, None]).astype(np.float32)
         stokes[~self.is_determined], errors[~self.is_determined] = np.nan, np.nan
         return {"stokes": stokes, "stokes_errors": errors}

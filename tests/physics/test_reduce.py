@@ -122,10 +122,8 @@ def test_errors_are_those_of_the_noise(case: str, rgb950: InstrumentModel, synth
     image = reduced(path, rgb950)
     pulls = ((image.values - m) / image.errors).reshape(16, -1)
     # 2000 pixels: the variance of one element's pulls is known to 3 % (one sigma), the mean of 16 to 1 %.
-    # With sigma from 24 degrees of freedom the pulls follow Student's t, variance 24 / 22.
-    expected = 24 / 22 if case == "unknown gain" else 1.0
-    assert np.mean(pulls**2) == pytest.approx(expected, abs=0.03)
-    assert np.all(np.abs(np.mean(pulls**2, axis=1) - expected) < 0.14)
+    assert np.mean(pulls**2) == pytest.approx(1, abs=0.03)
+    assert np.all(np.abs(np.mean(pulls**2, axis=1) - 1) < 0.14)
     if case != "unknown gain":
         assert image.facts["median_reduced_chi_square"] == pytest.approx(1.0, abs=0.08)
     else:

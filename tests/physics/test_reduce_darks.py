@@ -225,8 +225,7 @@ def test_noise_of_few_darks_is_in_the_errors_of_all_results(
     off = np.subtract(*(image.values[1, 1].astype(float) / image.values[0, 0] for image in images))
     values["a difference"] = off - off.mean(), difference_errors(images, [element_gradient(i, 5) for i in images])
     for name, (error, claimed) in values.items():
-        # Without a gain the pulls of 11 degrees of freedom have 1.1.
-        assert np.sqrt(np.mean(np.square(error / claimed))) == pytest.approx(1 if gain else 1.05, abs=0.1), name
+        assert np.sqrt(np.mean(np.square(error / claimed))) == pytest.approx(1, abs=0.1), name
 
 
 @pytest.mark.parametrize("darks", [0, 1, 4])

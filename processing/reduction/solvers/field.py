@@ -108,9 +108,6 @@ class FieldSolver:
             with np.errstate(divide="ignore", invalid="ignore"):
                 ratio = np.where(before > 0, found["residual_rms"][pixels] / before, 1.0)
             found["reduced_chi_square"][pixels] *= ratio**2
-            if self.noise is None:
-                dark, errors = self.plain.black[:16].sum(axis=1, keepdims=True), found["mueller_errors"][:, pixels]
-                errors[:] = np.sqrt((np.square(errors) - dark) * np.square(ratio) + dark)
 
 
 def _centred(index: NDArray[np.int64], size: int) -> NDArray[np.float64]:

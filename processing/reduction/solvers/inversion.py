@@ -77,11 +77,6 @@ class Inversion:
         """Degrees of freedom of the residual of a pixel."""
         return self.degrees_of_freedom - self.spent
 
-    @property
-    def unit_covariance(self) -> NDArray[np.float64]:
-        """Covariance (K, K) for unit variance of every intensity."""
-        return np.asarray(self.pinv @ self.pinv.T)
-
 
 def multiply_tiles(
     matrix: NDArray[np.float32],

@@ -35,21 +35,22 @@ class MuellerSolver:
         self.stack = np.concatenate(stack).astype(np.float32)
         self.first_square = len(inversion.pinv) + len(inversion.null)
         black = reader.correction.black
-        excess = np.repeat(black.excess(noise, reader.exposure_s), channels)
+        # Residuals tell the noise of light; what darks have they tell themselves.
+        camera = noise if noise is not None and noise.own is None else None
+        excess = np.repeat(black.excess(camera, reader.exposure_s), channels)
         #: Variance without light of each intensity (N,), counts^2.
         self.intensity_floor = (
             noise.floor_of_rows(self.repeats, excess, channels) if noise else np.zeros(inversion.w.shape[0])
         )
         self.floor = (squares * self.intensity_floor).reshape(17, -1, channels).sum(axis=1).astype(np.float32)
         # The black is the same in all states of one exposure of a channel, so its error is common to them.
-        self.black_variance = black.mean_variance(noise)
+        self.black_variance = black.mean_variance(camera)
         seen = np.concatenate([inversion.pinv, inversion.null]).reshape(-1, len(reader.repeats), channels)
         pushed = np.einsum("knc,nd->kcd", seen, reader.black_weights) * np.sqrt(self.black_variance)
         #: Errors (16, means of darks) of the elements, counts, that one standard error of each mean of darks makes.
         self.dark_errors = pushed[:16].reshape(16, -1)
         drive = np.square(pushed).sum(axis=2)
         self.black = np.concatenate([drive[:16], drive[16:].sum(axis=0, keepdims=True)]).astype(np.float32)
-        self.unit_sigma = np.sqrt(np.diag(inversion.unit_covariance)).astype(np.float32)
 
     def solve(self, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
         """Mueller elements, errors, residual and mask of frames (N, channels, pixels) that the reader just read."""
@@ -86,9 +87,7 @@ class MuellerSolver:
             rss = np.einsum("np,np->p", result[16:square], result[16:square])
             out["residual_rms"][a:b] = np.sqrt(rss / n)
             if self.noise is None:
-                sigma = np.sqrt(rss / free) if dof else np.full(b - a, np.nan, np.float32)
-                dark = self.black[:16] @ (np.ones((self.black.shape[1], 1), np.float32) if gain is None else gain**2)
-                np.sqrt(np.square(self.unit_sigma[:, None] * sigma) + dark, out=out["mueller_errors"][:, a:b])
+                out["mueller_errors"][:, a:b] = np.nan
                 continue
             variance = self._variance(part, gain, result[square:], self.noise)
             np.sqrt(variance[:16], out=out["mueller_errors"][:, a:b])
@@ -145,7 +144,7 @@ def solve_with_the_sound(
             scale = np.asarray(np.broadcast_to(unit[None], raw.shape).reshape(n, -1).T, dtype=float)
             variance, expected = _expected(solver, solve, keep, y, scale=scale)
             if solver.noise is None:
-                variance += np.einsum("pin,pin->ip", solve, solve) * (rss / free)
+                variance[:] = np.nan
             else:
                 found["reduced_chi_square"][part] = np.where(free > 0, rss / expected, np.nan)
             found["mueller_errors"][:, part] = np.sqrt(variance)
@@ -163,8 +162,6 @@ def _expected(
     scale: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Variances (16, pixels) and expected sum of squared residuals (pixels,) of fits to the states kept.
-
-    Without a noise model they contain the error of the darks alone.
 
     solve (pixels, 16, N) is each pixel's least-squares matrix, 0 where a state is left out; y and keep (pixels, N);
     scale (pixels, N) is 1 / flat. The residual of least squares is a projection, so noise of variance v leaves the
