@@ -187,4 +187,6 @@ def test_quantities_of_parts_are_those_of_the_whole_image(plain, synthetic_captu
     parts = quantities.quantities_block(image, quantities.EXTRA, {}, moves)
     assert list(parts) == list(whole)
     for name, plane in whole.items():
-        np.testing.assert_allclose(parts[name], plane, rtol=1e-3, atol=1e-3, err_msg=name)
+        # Sums of float32, whose order the BLAS chooses by their number, and which may cancel.
+        largest = np.nanmax(np.abs(plane), initial=1, where=np.isfinite(plane))
+        np.testing.assert_allclose(parts[name], plane, rtol=1e-5, atol=1e-6 * largest, err_msg=name)
