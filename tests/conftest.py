@@ -62,27 +62,34 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the tests marked `long`, or let every test process begin with its share of them.
+    """Leave out the tests marked `long`, or let every test process begin with its share of the files that have some.
 
     Each gets an equal number of tests, in the order of `items`; one that has ended takes half of what another has left,
-    from the end. A long test there would be the last to run, with nothing beside it.
+    from the end. A long test there would be the last to run, with nothing beside it. A file stays whole: what its tests
+    share is made once.
     """
-    long = [item for item in items if item.get_closest_marker("long")]
-    short = [item for item in items if not item.get_closest_marker("long")]
+    long = {item for item in items if item.get_closest_marker("long")}
     if not config.option.all:
         config.stash[LEFT_OUT] = len(long)
-        config.hook.pytest_deselected(items=long)
-        items[:] = short
+        config.hook.pytest_deselected(items=[*long])
+        items[:] = [item for item in items if item not in long]
         return
     processes = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if processes == 1:
         return
+    files: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    weights = {path: len(long.intersection(tests)) for path, tests in files.items()}
+    shares: list[list[pytest.Item]] = [[] for _ in range(processes)]
+    for path in sorted(filter(weights.get, files), key=lambda path: -weights[path]):
+        min(shares, key=lambda share: len(long.intersection(share))).extend(files[path])
+    short = [item for path, tests in files.items() if not weights[path] for item in tests]
     dealt: list[pytest.Item] = []
-    for n in range(processes):
-        first = long[n::processes]
-        count = (len(items) - len(dealt)) // (processes - n) - len(first)
-        dealt += first + short[: max(count, 0)]
-        del short[: max(count, 0)]
+    for n, first in enumerate(shares):
+        count = max((len(items) - len(dealt)) // (processes - n) - len(first), 0)
+        dealt += first + short[:count]
+        del short[:count]
     items[:] = dealt + short
 
 

@@ -101,7 +101,7 @@ def _parts(size: int) -> list[slice]:
 
 def _changes(products: list[Path], region: Region) -> list[Changed]:
     """Relative change of the light, then the changes of the elements over it."""
-    new, old = ({mean.name: mean for mean in mean_of([path], region)} for path in products)
+    new, old = ({mean.name: mean for mean in mean_of([path], region, elements_only=True)} for path in products)
     light = next(name for name in LIGHT if name in new)
     level = old[light].value
     noise = float(np.hypot(new[light].u_noise, old[light].u_noise)) / level

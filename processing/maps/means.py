@@ -127,12 +127,13 @@ def coverage_factor(degrees_of_freedom: float) -> float:
     return NORMAL_95 if np.isinf(degrees_of_freedom) else float(stdtrit(max(degrees_of_freedom, 1.0), 0.975))
 
 
-def mean_of(sources: Sequence[Path], region: Region) -> list[MeanValue]:
+def mean_of(sources: Sequence[Path], region: Region, *, elements_only: bool = False) -> list[MeanValue]:
     """Mean M or S over a region of products of one kind, and every quantity of it.
 
     Parameters
     ----------
     region : rows and columns, inside each frame.
+    elements_only : of M without its quantities, which take most of the time.
 
     Raises
     ------
@@ -147,8 +148,11 @@ def mean_of(sources: Sequence[Path], region: Region) -> list[MeanValue]:
                 "no uncertainty of its instrument. Give those that belong together."
             )
     together = _combine(means)
-    each = [mean.numbers() for mean in means] if len(means) > 1 else []
-    return [_value(name, n, [e[name].value for e in each], together.inputs) for name, n in together.numbers().items()]
+    each = [mean.numbers(elements_only) for mean in means] if len(means) > 1 else []
+    return [
+        _value(name, number, [e[name].value for e in each], together.inputs)
+        for name, number in together.numbers(elements_only).items()
+    ]
 
 
 class _Number(NamedTuple):
@@ -206,12 +210,13 @@ class _Mean:
         fitted = image if full.sent is None else replace(full, sent=image.values[:, 0], mask=image.mask)
         return cls(image, moves_of_light(systematic, fitted, is_held=False), inputs)
 
-    def numbers(self) -> dict[str, _Number]:
+    def numbers(self, elements_only: bool) -> dict[str, _Number]:
         # Without light a ratio is NaN.
         with np.errstate(divide="ignore", invalid="ignore"):
             if isinstance(self.image, StokesImage):
                 return _stokes_numbers(self.image, self.moves[..., 0, 0])
-            return _mueller_numbers(self.image, self.moves)
+            elements = _element_numbers(self.image, self.moves)
+            return elements if elements_only else elements | _quantity_numbers(self.image, self.moves)
 
 
 def _good(mask: NDArray[np.uint8], values: NDArray[np.floating], source: Path) -> NDArray[np.bool_]:
@@ -311,7 +316,7 @@ def _stokes_numbers(image: StokesImage, moves: Array) -> dict[str, _Number]:
     return numbers
 
 
-def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
+def _element_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
     numbers, m = {}, image.values.reshape(16).astype(float)
     light = is_first_column(image.is_determined)
     for k in np.flatnonzero(image.is_determined).tolist():
@@ -327,15 +332,18 @@ def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
         else:
             name, unit = ("m00", "count") if k == 0 else (f"m{k // 4}{k % 4}_over_m00", "")
         numbers[name] = _Number(float(value), error, moved, unit)
+    return numbers
+
+
+def _quantity_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
+    numbers: dict[str, _Number] = {}
+    light = is_first_column(image.is_determined)
     by_input: dict[str, NDArray[Any]] = {}
-    # Intervals by noise alone first: those of the second are wider by the instrument's uncertainty.
     if image.is_determined.all():
-        planes = quantities_block(image, (), PAPER_PAIRS)
-        quantities_block(image, (), PAPER_PAIRS, moves, by_input=by_input)
+        planes = quantities_block(image, (), PAPER_PAIRS, moves, by_input=by_input)
     else:
         names = light_quantities(image.is_determined) if light else determined_maps(image.is_determined, PAPER_PAIRS)
-        planes = partial_block(image, names, PAPER_PAIRS)
-        partial_block(image, names, PAPER_PAIRS, moves, by_input=by_input)
+        planes = partial_block(image, names, PAPER_PAIRS, moves, by_input=by_input)
     if light:
         planes, by_input = rename_planes(planes), rename_planes(by_input)
     for name in by_input:

@@ -69,7 +69,8 @@ def partial_block(
         set_ellipticity(planes)
         set_ratios(planes, derived, image, m[..., 0, 0])
         if moves is not None:
-            moved = set_systematic(planes, {name: derived[name] for name in names}, moves)
+            into = planes if by_input is None else dict(planes)
+            moved = set_systematic(into, {name: derived[name] for name in names}, moves)
             if by_input is not None:
                 by_input |= moved
     planes["lit"] = is_lit(image.values[0, 0], image.errors[0, 0]).astype(np.uint8)

@@ -205,7 +205,7 @@ def quantities_block(
     ----------
     moves : (D, 16, rows, columns), what each uncertain input of the instrument does to M; see `moves_of`.
     by_input : of an image of at most `CACHED_PIXELS`: filled with what each does to the n numbers of each map,
-        (n, pixels, D).
+        (n, pixels, D). The planes are then those of noise alone.
     """
     shape = image.values.shape[2:]
     size = shape[0] * shape[1]
@@ -257,7 +257,7 @@ def _cached_block(
         polar = lu_chipman(m)
         _set_intervals(planes, derived, m, image, depolarizer=polar.depolarizer, retardance=retardance)
         if moves is not None:
-            moved = set_systematic(planes, derived, moves)
+            moved = set_systematic(planes if by_input is None else dict(planes), derived, moves)
             if by_input is not None:
                 by_input |= moved
     planes["lit"] = np.isfinite(lit[..., 0, 0]).astype(np.uint8)
