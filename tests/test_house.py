@@ -3,7 +3,6 @@
 import ast
 import re
 import runpy
-import shutil
 import subprocess
 import sys
 import tomllib
@@ -72,7 +71,9 @@ def two_tests(tmp_path):
     """Runs pytest over a short and a long test with the tests' own conftest; returns what it prints."""
     (tmp_path / "pytest.ini").write_text("[pytest]\ntestpaths = tests\nmarkers = long\n")
     (tmp_path / "tests").mkdir()
-    shutil.copy(ROOT / "tests/conftest.py", tmp_path / "tests")
+    shared = (ROOT / "tests/conftest.py").read_text(encoding="utf-8")
+    # Loading what draws takes most of the time.
+    (tmp_path / "tests/conftest.py").write_text(re.sub(r"^import matplotlib.*\n", "", shared, flags=re.M))
     (tmp_path / "tests/test_two.py").write_text(
         "import pytest\n\ndef test_short(): pass\n\n@pytest.mark.long\ndef test_long(): pass\n"
     )

@@ -50,7 +50,7 @@ def results(lines: list[str]) -> list[tuple[str, str]]:
 @pytest.mark.parametrize(
     ("command", "kind", "options"),
     [("reduce", "mueller.h5", ["--no-figure"]), ("xi0", "xi0.h5", ["--no-figure"]),
-     pytest.param("export", "png", ["--to", "png"], marks=pytest.mark.long),
+     ("export", "png", ["--to", "png", "--plane", "reduced_chi_square"]),
      *(("export", to, ["--to", to]) for to in ("csv", "fits"))],
 )  # fmt: skip
 def test_a_folder_twice_makes_nothing_twice(command, kind, options, lab, process):

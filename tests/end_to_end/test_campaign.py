@@ -4,8 +4,6 @@ import csv
 import json
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
@@ -18,6 +16,7 @@ from scipy.ndimage import binary_erosion
 from processing.campaign.captures import find_captures
 from processing.campaign.executors import executor
 from processing.campaign.run import PAPER, CampaignResult, ProcessedCampaign
+from processing.commands.application import main
 from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
@@ -28,6 +27,7 @@ from processing.storage.products.product import Product
 from simulators.bench.bench import SimulatedBench
 from simulators.bench.scene import Scene
 from simulators.bench.virtual_capture import write_virtual_capture
+from tests.commands import exit_code
 
 ANGLES = (35.0, 60.0)
 #: dask warns where a disc is slow, which another program can make it.
@@ -230,15 +230,15 @@ def test_a_cluster_gives_the_same_numbers(folder, serial, configs, tmp_path):
 
 @SLOW_DISC
 @pytest.mark.long
-def test_a_cluster_survives_a_capture_that_fails_and_a_worker_that_dies(configs, tmp_path):
+def test_a_cluster_survives_a_capture_that_fails_and_a_worker_that_dies(configs, tmp_path, capsys):
     distributed = pytest.importorskip("distributed")
 
     def process(*words):
-        # The workers write their own tracebacks to the output of this process.
-        command = [sys.executable, "-m", "processing.commands.application", *map(str, words)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert "Traceback" not in done.stderr
-        return done.returncode, done.stdout, done.stderr
+        # The workers write their own tracebacks to the files of this process, which `capsys` leaves alone.
+        code = exit_code(main, *words)
+        out, err = capsys.readouterr()
+        assert "Traceback" not in err
+        return code, out, err
 
     for number in range(5):
         small(tmp_path, configs, f"c{number}", 20 + number, states=8 if number == 2 else 40)

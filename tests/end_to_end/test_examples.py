@@ -5,7 +5,10 @@ import re
 import runpy
 from pathlib import Path
 
+import h5py
 import pytest
+
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 
 NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e-?\d+)?")
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -28,10 +31,26 @@ SAID = {
 LONG = {"close_the_loop", "design_states"}
 
 
+@pytest.fixture(scope="module")
+def answer():
+    """The diagnosis of a capture by its frames: the script and the notebook make the same."""
+    answers = {}
+
+    def diagnose(captures, instrument):
+        with h5py.File(captures[0]) as h5:
+            asked = h5["entry/instrument/detector/data"][...].tobytes(), instrument.model_dump_json()
+        if asked not in answers:
+            answers[asked] = diagnose_captures(captures, instrument)
+        return answers[asked]
+
+    return diagnose
+
+
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.long] if name in LONG else []) for name in SAID]
 )
-def test_script(name, tmp_path, monkeypatch, capsys, small_rig, default_rig):
+def test_script(name, tmp_path, monkeypatch, capsys, small_rig, default_rig, answer):
+    monkeypatch.setattr("processing.diagnose_captures", answer)
     monkeypatch.setattr("sys.argv", [name, str(tmp_path)])
     monkeypatch.chdir(tmp_path)
     # The rig of the examples has 360 000 pixels at a tenth of real time.
@@ -45,7 +64,8 @@ def test_script(name, tmp_path, monkeypatch, capsys, small_rig, default_rig):
 
 
 @pytest.mark.parametrize("name", ["capture_to_xi0", pytest.param("close_the_loop", marks=pytest.mark.long)])
-def test_notebook(name, capsys, monkeypatch):
+def test_notebook(name, capsys, monkeypatch, answer):
+    monkeypatch.setattr("processing.diagnose_captures", answer)
     monkeypatch.setenv("MPLBACKEND", "agg")
     cells = json.loads((EXAMPLES / f"{name}.ipynb").read_text())["cells"]
     scope: dict[str, object] = {}
