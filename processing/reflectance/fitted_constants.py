@@ -206,7 +206,9 @@ def result_of(
     effect = np.abs(constants - np.eye(len(constants))[0])
     limit = np.maximum(RELATIVE_LIMIT * effect, of.small)
     # k and a may well be 0. An n at the end of its range is no surface, and errors to first order hold about one n.
-    fixed = (stderr <= limit) & inside[0] & (stderr[0] <= limit[0])
+    # Linear light sees k by its square: at k = 0 the errors of the others have no share of it.
+    is_regular = inside[0] if departures is None else inside.all()
+    fixed = (stderr <= limit) & is_regular & (stderr[0] <= limit[0])
     identified = dict(zip(of.names, fixed.tolist(), strict=True))
     return MaterialFit(
         kind=of.kind,

@@ -16,6 +16,7 @@ from processing.polarization.mueller import coherency, coherency_to_mueller
 from processing.reduction.sent_light import sent_rows
 from processing.reflectance.fitted_constants import MaterialFit
 from processing.reflectance.material_fit import DIFFUSE, fit_values
+from processing.reflectance.polarized_diffuse import Model
 from simulators.bench.scene import Scene
 
 NAMES = DIFFUSE.names
@@ -193,6 +194,20 @@ def test_what_is_fitted_beside_an_n_that_is_not_fixed_is_not_identified(sphere, 
     p, variance = noisy(m / m[:, 0, 0].mean(), stokes(VERTICAL), seed, 12_000)
     fit = fit_intensities(geometry, p, stokes(VERTICAL), variance)
     assert fit.stderr[3] < 0.3 * fit.constants[3]
+    assert not any(fit.identified.values())
+
+
+@pytest.mark.parametrize("seed", [2, 3, 6])
+def test_a_k_at_its_bound_identifies_nothing(sphere, seed):
+    """n was 1.43 +- 0.05 where it is 1.69: linear light sees k by its square, errors at k = 0 have no share of it."""
+    geometry = sphere[0][::2]
+    constants = {662.0: {"n": 1.686, "k": 0.08, "a": 0.387, "b": 1.236}}
+    material = Model(name="test", source="test", constants=constants)
+    m = 0.6 * material.mueller_jones(geometry, 662)
+    m[:, 0, 0] = 1
+    p, variance = noisy(apart(m, np.random.default_rng(seed), 0.04), stokes(VERTICAL), seed, 4000)
+    fit = fit_intensities(geometry, p, stokes(VERTICAL), variance)
+    assert fit.constants[1] == pytest.approx(0, abs=1e-3)
     assert not any(fit.identified.values())
 
 
