@@ -40,6 +40,7 @@ INSTRUMENTS = {
     ),
 }
 GAIN, READ = 2.0, 3.0
+STEPS = (Step("reduce", {}),)
 SAMPLE = np.array([[1, 0.2, -0.1, 0.05], [0.15, 0.6, 0.1, -0.2], [-0.3, 0.05, 0.5, 0.1], [0.2, 0.1, -0.15, 0.4]])
 
 
@@ -109,7 +110,7 @@ def test_saturated_states_are_left_out_there_too(weighted, noisy, tmp_path):
 def test_quantities_are_those_that_the_elements_give(name, noisy, tmp_path):
     path, model, _ = noisy(name, INSTRUMENTS[name][1])
     with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
     quantities_of_mueller(tmp_path / "m.h5", tmp_path / "q.h5", Step("quantities", {}))
     truth = {
         "diattenuation_linear": np.hypot(0.2, 0.1),
@@ -149,7 +150,7 @@ def test_xi0_comes_with_a_model_of_the_dominant_process(name, noisy, tmp_path, m
     m0 = normalized_mueller(jones)
     path, model, _ = noisy(name, INSTRUMENTS[name][1], sample=np.asarray(mueller_matrix(m0, xi0, 1.0)))
     with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
     monkeypatch.setattr(maps, "dominant_model", lambda *_: np.tile(m0, (30, 40, 1, 1)))
     maps.xi0_of_partial(
         tmp_path / "m.h5", "geometry", "material", tmp_path / "x.h5", step=Step("xi0", {}), overwrite=False
@@ -168,7 +169,7 @@ def test_polarized_light_gives_the_stokes_vector_that_is_sent_back_and_xi0(name,
     sample = np.asarray(mueller_matrix(m0, xi0, 1.0))
     path, model, scale = noisy(name, INSTRUMENTS[name][1], sample=sample, sent_deg=20.0)
     with Capture(path) as capture:
-        facts = reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+        facts = reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
     count = facts["rank"]
     assert facts["determined"].startswith(", ".join(f"S{k}" for k in range(count)) + " of the light")
     with pytest.raises(ProductError, match=r"needs all 16 elements\. With a model"):
@@ -222,7 +223,7 @@ def test_the_covariance_of_the_stokes_vector_is_that_of_its_scatter(sent_deg, no
     angles = {"psa": np.array([-51.7, -15.1, 15.1, 51.7, 20.0, 70.0])}
     path, model, _ = noisy("rotating_retarder_stokes", angles, sent_deg=sent_deg)
     with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
     quantities_of_mueller(tmp_path / "m.h5", tmp_path / "q.h5", Step("quantities", {}))
     with Product(tmp_path / "q.h5") as product:
         packed = product.get("stokes_covariance").reshape(10, -1).mean(axis=1)
@@ -246,7 +247,7 @@ def test_the_ellipticity_is_in_its_interval_for_any_light(vector, sent_deg, nois
     sample[:, 0] = 1, *vector
     path, model, _ = noisy("rotating_retarder_stokes", {"psa": 22.5 * np.arange(16)}, sample=sample, sent_deg=sent_deg)
     with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
     quantities_of_mueller(tmp_path / "m.h5", tmp_path / "q.h5", Step("quantities", {}))
     truth = np.rad2deg(np.arctan2(vector[2], np.hypot(*vector[:2]))) / 2
     with Product(tmp_path / "q.h5") as product:
@@ -266,7 +267,7 @@ def test_the_mean_of_a_stokes_polarimeter_has_the_names_of_light(sent_deg, noisy
     sample[:, 0] = 1, 0.3, 0.2, -0.4
     path, model, _ = noisy("rotating_retarder_stokes", {"psa": 22.5 * np.arange(16)}, sample=sample, sent_deg=sent_deg)
     with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
     means = {mean.name: mean for mean in mean_of([tmp_path / "m.h5"], (slice(0, 30), slice(0, 40)))}
     truth = {"s1_over_s0": 0.3, "s2_over_s0": 0.2, "s3_over_s0": -0.4, "dolp": np.hypot(0.3, 0.2), "docp": -0.4}
     truth |= {"dop": np.sqrt(0.29), "aolp_deg": np.rad2deg(np.arctan2(0.2, 0.3)) / 2}
@@ -274,6 +275,26 @@ def test_the_mean_of_a_stokes_polarimeter_has_the_names_of_light(sent_deg, noisy
     assert means.keys() == {"s0", *truth}
     for name, true in truth.items():
         assert abs(means[name].value - true) < 4 * means[name].u, name
+
+
+@pytest.mark.parametrize("name", ["rotating_analyzer", "linear_mueller"])
+def test_an_uncertain_instrument_leaves_the_noise_of_a_mean_as_it_is(name, noisy, tmp_path):
+    path, model, _ = noisy(name, INSTRUMENTS[name][1])
+    means = []
+    for k, stderr in enumerate([{}, {"analyzer.azimuth_deg": 0.5}]):
+        with Capture(path) as capture:
+            reduce_mueller(capture, model.model_copy(update={"stderr": stderr}), tmp_path / f"{k}.h5", STEPS)
+        means.append({m.name: m for m in mean_of([tmp_path / f"{k}.h5"], (slice(0, 30), slice(0, 40)))})
+    certain, uncertain = means
+    assert certain.keys() == uncertain.keys()
+    for quantity, mean in certain.items():
+        moved = uncertain[quantity]
+        assert moved.u_noise == pytest.approx(mean.u_noise, rel=1e-6), quantity
+        # The interval is that of the noise, wider by the instrument's share once.
+        if mean.low > 0:
+            wider = np.hypot(mean.value - mean.low, 1.96 * moved.u_systematic)
+            assert moved.value - moved.low == pytest.approx(wider, rel=1e-3), quantity
+    assert np.mean([m.u_systematic > m.u_noise for m in uncertain.values()]) > 0.5
 
 
 def titles(product):
@@ -284,7 +305,7 @@ def test_a_stokes_polarimeter_has_a_figure_of_the_stokes_vector(noisy, tmp_path)
     name = "rotating_retarder_stokes"
     path, model, _ = noisy(name, INSTRUMENTS[name][1])
     with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
     with Product(tmp_path / "m.h5") as product:
         shown = " ".join(titles(product))
     assert re.findall(r"S_\d / S_0", shown) == ["S_1 / S_0", "S_2 / S_0", "S_3 / S_0"]
@@ -303,7 +324,7 @@ def test_a_stokes_polarimeter_has_a_figure_of_the_stokes_vector(noisy, tmp_path)
 def test_the_figure_of_a_partial_mueller_image_says_what_is_not_determined(noisy, tmp_path):
     path, model, _ = noisy("linear_mueller", INSTRUMENTS["linear_mueller"][1])
     with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
     with Product(tmp_path / "m.h5") as product:
         texts = [text.get_text() for panel in product_figure(product).axes for text in panel.texts]
     assert texts.count("not\ndetermined") == 7
@@ -312,7 +333,7 @@ def test_the_figure_of_a_partial_mueller_image_says_what_is_not_determined(noisy
 def test_states_that_see_less_than_the_instrument_can_are_refused(noisy, tmp_path):
     path, model, _ = noisy("rotating_retarder_stokes", {"psa": np.array([0.0, 90, 180, 270])})
     with Capture(path) as capture, pytest.raises(NotDetermined, match=r"rank \d, and 4 are needed") as refusal:
-        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
     # Nothing of elements that it never sees, nor of angles of two retarders.
     assert "m30" in str(refusal.value)
     assert not any(word in str(refusal.value) for word in ("m01", "4.91"))
@@ -323,7 +344,7 @@ def test_what_needs_the_whole_matrix_says_so(noisy, configs, tmp_path):
     with Capture(path) as capture:
         with pytest.raises(ProcessError, match="3 of 16 numbers"):
             reduce_mueller(capture, model, tmp_path / "p.h5", (Step("reduce", {}),), choice=Choice(physical="nearest"))
-        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
     with pytest.raises(ProductError, match="determines m00, m10, m20, and this needs all 16"):
         xi0_of_mueller(tmp_path / "m.h5", tmp_path / "x.h5", Step("xi0", {}), False, progress=None)
     for refused in (
