@@ -1,4 +1,4 @@
-"""Two captures, or two products, side by side: their difference, and the difference over its error."""
+"""Two captures, or two products, side by side: their difference or ratio, and that over its error."""
 
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,9 @@ from viewer.products import DERIVED, choices_of, is_whole, named, read_map, unit
 
 #: Errors at the ends of the scale of a difference over its error.
 ERRORS_SHOWN = 5.0
+
+#: [standard errors] Least size of a number that something is divided by: the error of the ratio is of first order.
+DIVISOR = 5.0
 
 #: Values and their standard errors, each (rows, columns).
 Measured = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -86,29 +89,40 @@ def _same_shape(a: tuple[int, int], b: tuple[int, int]) -> None:
 
 
 def difference(request: Request) -> Response:
-    """Four pictures of one window: a, b, a - b, and that over its standard error, of noise and instrument together."""
+    """Four pictures of one window: a, b, a - b, and that over its standard error, of noise and instrument together.
+
+    With `ratio` in the query a / b - 1 takes the place of a - b.
+    """
     a, b, query = file_of(request, "a"), file_of(request, "b"), request.query_params
+    is_ratio = bool(query.get("ratio"))
     if is_product(a):
         with Product(a) as first, Product(b) as second:
             _same_shape(first.shape, second.shape)
             window = Window.parse(query, first.shape, most=640)
             plane_a, plane_b = (product_values(product, query, window) for product in (first, second))
-            shared = _shared_errors(first, second, query, window)
-            systematic = _systematic_errors(first, second, query, window)
+            slopes = _slopes(plane_a, plane_b, is_ratio)
+            shared = _shared_errors(first, second, query, window, slopes=slopes)
+            systematic = _systematic_errors(first, second, query, window, slopes=slopes)
             name, index = queried_map(first, query)
             units = "" if name == "mueller" or name in DERIVED else first.units(name)
             scale = scale_of("m00" if name == "mueller" and index == 0 else name, units, plane_a[0])
+    elif is_ratio:
+        raise ProcessError("counts contain the black level and have no ratio; reduce the captures and compare products")
     else:
         shared, systematic = None, np.zeros(())
         with Capture(a) as early, Capture(b) as late:
             _same_shape(early.frame_shape, late.frame_shape)
             window = Window.parse(query, early.frame_shape, most=640)
             plane_a, plane_b = (capture_values(capture, query, window) for capture in (early, late))
+            slopes = _slopes(plane_a, plane_b, is_ratio)
             name, units, scale = None, "counts", ColourScale(LIGHT, *_ends(plane_a[0]))
-    deviation = plane_a[0] - plane_b[0]
-    if (period := None if name is None else period_deg(name, units)) is not None:
+    period = None if name is None else period_deg(name, units)
+    if is_ratio and period is not None:
+        raise ProcessError(f"{name} is an angle: two angles have a difference and no ratio")
+    deviation = (plane_a[0] - plane_b[0]) * (slopes[0] if is_ratio else 1)
+    if period is not None:
         deviation = (deviation + period / 2) % period - period / 2
-    noise = np.hypot(plane_a[1], plane_b[1]) if shared is None else shared
+    noise = np.hypot(slopes[0] * plane_a[1], slopes[1] * plane_b[1]) if shared is None else shared
     with np.errstate(divide="ignore", invalid="ignore"):
         significance = deviation / np.hypot(noise, systematic)
     wide = scale_of("deviation", "", deviation)
@@ -123,6 +137,15 @@ def difference(request: Request) -> Response:
         rms_systematic=_rms(np.asarray(systematic)),
         rms_over=_rms(significance),
     )
+
+
+def _slopes(a: Measured, b: Measured, is_ratio: bool) -> NDArray[np.floating]:
+    """Derivatives (2, rows, columns) of a - b by a and -b, or of a / b; NaN where b is hardly different from zero."""
+    if not is_ratio:
+        return np.ones((2, *a[0].shape))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(np.abs(b[0]) < DIVISOR * b[1], np.nan, 1 / b[0].astype(float))
+    return np.stack([inverse, a[0] * inverse**2])
 
 
 def _rms(values: NDArray[np.floating]) -> float | None:
@@ -158,8 +181,10 @@ def product_values(product: Product, query: Any, window: Window) -> Measured:
     return values, read_map(product, f"{name}_errors", index, window)
 
 
-def _shared_errors(first: Product, second: Product, query: Any, window: Window) -> NDArray[np.floating] | None:
-    """Errors of a difference of products of one capture, which share its noise; None of two captures.
+def _shared_errors(
+    first: Product, second: Product, query: Any, window: Window, *, slopes: NDArray[np.floating]
+) -> NDArray[np.floating] | None:
+    """Errors of a difference or ratio of products of one capture, which share its noise; None of two captures.
 
     NaN where the share is not known: maps of which a product holds no gradient.
     """
@@ -171,20 +196,27 @@ def _shared_errors(first: Product, second: Product, query: Any, window: Window) 
     if not (name == "mueller" or _is_derived(first, query)) or not first.kind == second.kind == "mueller":
         return np.full(window.shape, np.nan)
     images = [_image(product, window) for product in (first, second)]
-    slopes = [element_gradient(i, index) if name == "mueller" else _derived(i, name).gradient for i in images]
-    return difference_errors(images, slopes).reshape(window.shape)
+    gradients = [element_gradient(i, index) if name == "mueller" else _derived(i, name).gradient for i in images]
+    by_element = [g * s.reshape(*g.shape[:-1], 1) for g, s in zip(gradients, slopes, strict=True)]
+    return difference_errors(images, by_element).reshape(window.shape)
 
 
-def _systematic_errors(first: Product, second: Product, query: Any, window: Window) -> NDArray[np.floating]:
-    """Error of a difference by the instruments' uncertainties, (rows, columns).
+def _systematic_errors(
+    first: Product, second: Product, query: Any, window: Window, *, slopes: NDArray[np.floating]
+) -> NDArray[np.floating]:
+    """Error of a difference or ratio by the instruments' uncertainties, (rows, columns).
 
     Products with the same uncertain inputs are of one instrument: its error leaves the difference as far as it moves
     both alike. Where only the size of both errors is known, they add.
     """
     (move_a, a), (move_b, b) = (_shifts(product, query, window) for product in (first, second))
+    slope_a, slope_b = slopes
+    a, b = a * np.abs(slope_a), b * np.abs(slope_b)
     if first.facts.get(INPUTS) != second.facts.get(INPUTS):
         return np.asarray(np.hypot(a, b))
-    return np.asarray(a + b if move_a is None or move_b is None else np.sqrt(np.square(move_a - move_b).sum(axis=0)))
+    if move_a is None or move_b is None:
+        return np.asarray(a + b)
+    return np.asarray(np.sqrt(np.square(move_a * slope_a - move_b * slope_b).sum(axis=0)))
 
 
 def _shifts(product: Product, query: Any, window: Window) -> tuple[NDArray[np.floating] | None, NDArray[np.floating]]:

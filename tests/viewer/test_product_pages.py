@@ -138,6 +138,29 @@ def test_products_of_one_capture_share_its_noise(client, lab, drr_capture, confi
     assert np.nanstd(over) == pytest.approx(1, abs=0.25)
 
 
+def test_a_ratio_has_the_errors_that_it_scatters_by(client, lab, drr_capture, configs, tmp_path):
+    instrument = tmp_path / "other.yaml"
+    instrument.write_text((configs / "instruments/rgb950.yaml").read_text().replace("662: 127.12", "662: 129.12"))
+    capture = drr_capture("one.h5")
+    Reduction(capture).make()
+    Reduction(capture, instrument).make(out=lab / "same.mueller.h5")
+    Reduction(drr_capture("two.h5", seed_of_noise=2, mueller=np.diag([1.0, 0.6, 0.4, 0.3]))).make()
+    query = {"a": "one.mueller.h5", "name": "mueller", "index": 5, "ratio": 1}
+    # Of two captures their errors count both, of one capture what the two products do not share.
+    (a, b, apart, over), header = plane(client.get("/difference", params=query | {"b": "two.mueller.h5"}))
+    np.testing.assert_allclose(apart, a / b - 1, atol=1e-6)
+    assert np.median(apart) == pytest.approx(0.5 / 0.6 - 1, abs=0.01)
+    assert np.std(over) == pytest.approx(1, abs=0.2)
+    (_, _, close, _), shared = plane(client.get("/difference", params=query | {"b": "same.mueller.h5"}))
+    assert np.std(close) == pytest.approx(shared["rms_noise"], rel=0.2)
+    assert shared["rms_noise"] < 0.3 * header["rms_noise"]
+    # An element that is zero divides nothing, an angle and counts have no ratio.
+    (_, _, none, _), _ = plane(client.get("/difference", params=query | {"b": "two.mueller.h5", "index": 1}))
+    assert np.mean(np.isnan(none)) > 0.99
+    for refused in ({"b": "two.mueller.h5", "name": "diattenuation_orientation_deg"}, {"a": "one.h5", "b": "two.h5"}):
+        assert client.get("/difference", params=query | refused).status_code == 422
+
+
 def test_a_difference_has_what_the_instruments_do_not_do_alike(client, lab, drr_capture, configs, tmp_path):
     """One instrument moves M of one sample alike in two captures, not that of another sample; two instruments add."""
     text = (configs / "instruments/rgb950.yaml").read_text()
