@@ -30,7 +30,7 @@ async function refresh(leader = views[0]) {
     const unit = how?.value ? "" : plane.units && ` ${plane.units}`, what = how?.value ? "A / B \u2212 1" : "A \u2212 B";
     byId("h2").textContent = what;
     byId("h3").textContent = `(${what}) over its standard error`;
-    byId("told").textContent = `rms of ${what}: ${told(plane.rms)}${unit}; its standard error by noise ${told(plane.rms_noise)}, by the instrument ${told(plane.rms_systematic)}; over its error ${told(plane.rms_over)} (1: errors alone)`;
+    byId("told").textContent = `rms of ${what}: ${told(plane.rms)}${unit}; its standard error by noise ${told(plane.rms_noise)}, by the instrument ${told(plane.rms_systematic)}; over its error ${told(plane.rms_over)} (1: errors alone)${how?.value ? "; empty where B is less than five of its standard errors" : ""}`;
     const ranges = leader.node.layout && [leader.node.layout.xaxis.range, leader.node.layout.yaxis.range];
     for (const [k, view] of views.entries()) {
       view.plane = plane;
