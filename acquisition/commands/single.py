@@ -118,6 +118,11 @@ def _run(options: Options, stop: StopRequest) -> int:
 def _job(options: Options) -> tuple[Job, Path, bool]:
     """The job, its file or the preferred name of a new one, and whether the file is resumed."""
     if options.resume is None:
+        if options.out.suffix == ".h5":
+            raise ConfigError(
+                f"--out {options.out} would be a folder: captures get their names from time, sample and angle. "
+                f"Give the folder: --out {options.out.parent}"
+            )
         job = prepare(plan_of(options), rig_of(options))
         return job, options.out / default_name(job.plan), False
     _refuse_with_resume(options)

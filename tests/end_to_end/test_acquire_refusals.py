@@ -118,6 +118,13 @@ def test_plan_outside_what_the_rig_can_do(refused, small_rig, arguments, words):
     assert all(word in err for word in words), err
 
 
+def test_a_file_is_no_folder_for_captures(acquire, small_rig, tmp_path):
+    code, _, err = acquire("--omega", 35, "--rig", small_rig(), "--out", tmp_path / "one.h5")
+    assert code == 2
+    assert f"--out {tmp_path}" in err
+    assert not (tmp_path / "one.h5").exists()
+
+
 def test_states_that_do_not_determine_a_mueller_matrix(refused, small_rig, tmp_path):
     plan = tmp_path / "plan.yaml"
     plan.write_text("kind: plan\nstates: {kind: rotating_retarders, states: 40, step_deg: 9, ratio: 5}\n")
