@@ -119,7 +119,7 @@ def difference(request: Request) -> Response:
     period = None if name is None else period_deg(name, units)
     if is_ratio and period is not None:
         raise ProcessError(f"{name} is an angle: two angles have a difference and no ratio")
-    deviation = (plane_a[0] - plane_b[0]) * (slopes[0] if is_ratio else 1)
+    deviation = (plane_a[0] - plane_b[0]) * slopes[0]
     if period is not None:
         deviation = (deviation + period / 2) % period - period / 2
     noise = np.hypot(slopes[0] * plane_a[1], slopes[1] * plane_b[1]) if shared is None else shared

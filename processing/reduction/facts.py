@@ -73,7 +73,7 @@ def mueller_facts(
         facts["flat_error_percent"] = 100 * float(np.sqrt(np.median(correction.flat.relative_variance(noise))))
     if noise is None and inversion.degrees_of_freedom == 0:
         warnings.append("as many unknowns as intensities and no gain: there are no standard errors")
-    if noise is not None and noise.own is None and inversion.degrees_of_freedom:
+    if noise is not None and noise.residual_share is None and inversion.degrees_of_freedom:
         ratio = _median(product.get("reduced_chi_square", some))
         facts["median_reduced_chi_square"] = ratio
         if ratio > SUSPICIOUS_CHI_SQUARE:

@@ -197,7 +197,7 @@ class MuellerReduction:
     @property
     def planes(self) -> dict[str, Plane]:
         """Datasets of the image."""
-        planes = self.choice.planes(known_noise=self.noise is not None and self.noise.own is None)
+        planes = self.choice.planes(known_noise=self.noise is not None and self.noise.residual_share is None)
         planes |= SENT_PLANES if self.sent is not None else {}
         if self.systematic is not None:
             planes |= SYSTEMATIC if self.sent is None else SENT_SYSTEMATIC
@@ -221,7 +221,7 @@ class MuellerReduction:
         planes = self._estimate(solver, frames)
         lost = (planes["pixel_flags"] & LOST) != 0
         if self.sent is not None:
-            planes |= self.sent.planes(planes["mueller"], self._over(planes), solver)
+            planes |= self.sent.planes(planes["mueller"], self._variance_ratio(planes), solver)
             if self.systematic is not None:
                 planes["stokes_systematic"] = self.systematic.errors(planes["mueller"], self.sent.rows)
                 planes["stokes_systematic"][~self.sent.is_determined] = np.nan
@@ -232,19 +232,19 @@ class MuellerReduction:
 
     def _estimate(self, solver: Solver, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
         planes = solver.solve(frames)
-        if self.noise is not None and self.noise.own:
+        if self.noise is not None and self.noise.residual_share:
             # The error of the darks is common to all states and not in the residual.
             dark = np.square(solver.dark_errors).sum(axis=1, keepdims=True)
-            own = (np.square(planes["mueller_errors"]) - dark) * self._over(planes)
+            own = (np.square(planes["mueller_errors"]) - dark) * self._variance_ratio(planes)
             planes["mueller_errors"] = np.sqrt(own + dark)
         if self.levels is not None:
             self.levels.add_errors(planes, self.inversion)
         return planes
 
-    def _over(self, planes: dict[str, NDArray[Any]]) -> Array | float:
-        """Variance of each pixel over that of the line of all of them, as far as its own residual counts."""
-        own = None if self.noise is None else self.noise.own
-        return 1 + own * (planes["reduced_chi_square"] - 1) if own else 1.0
+    def _variance_ratio(self, planes: dict[str, NDArray[Any]]) -> Array | float:
+        """Variance of the noise of each pixel (pixels,) over what the noise model gives: its own residual's share."""
+        share = None if self.noise is None else self.noise.residual_share
+        return 1 + share * (planes["reduced_chi_square"] - 1) if share else 1.0
 
     def region(self, capture: Capture, rows: slice, columns: slice) -> tuple[MuellerImage, Array]:
         """A region as an image of one pixel, the mean of those that can be used, and its intensities (N channels,).

@@ -25,7 +25,7 @@ class NoiseModel:
     rounding : counts^2; 1/12 for whole counts, 0 for floating numbers.
     source : where the numbers come from, for the provenance.
     stated : counts^2; whole variance of one intensity of each state that is reduced, where the data state it.
-    own : share of each pixel's own residual in its variance; None where the noise is known without it.
+    residual_share : of each pixel's own residual in its variance; None if the noise is known without residuals.
     """
 
     slope: float
@@ -33,7 +33,7 @@ class NoiseModel:
     rounding: float
     source: str
     stated: tuple[float, ...] = ()
-    own: float | None = None
+    residual_share: float | None = None
 
     @classmethod
     def of(cls, detector: Detector, integer: bool) -> "NoiseModel | None":

@@ -70,8 +70,11 @@ class SentLight:
         names = ", ".join(f"S{k}" for k in np.flatnonzero(self.is_determined))
         return f"{names} of the light that the sample sends back (dataset stokes)"
 
-    def planes(self, mueller: Array, over: Array | float, solver: Solver) -> dict[str, Any]:
-        """Datasets `PLANES` (4, pixels) from the solution of least norm (16, pixels), its variance times `over`."""
+    def planes(self, mueller: Array, variance_ratio: Array | float, solver: Solver) -> dict[str, Any]:
+        """Datasets `PLANES` (4, pixels) from the solution of least norm (16, pixels), in counts.
+
+        `variance_ratio` (pixels,) or 1: variance of the noise over that of the solver's noise model.
+        """
         inversion = solver.inversion
         stokes = (self.rows @ mueller).astype(np.float32)
         floor = solver.intensity_floor[:, None]
@@ -81,6 +84,6 @@ class SentLight:
         channels = solver.reader.capture.channels
         drive = np.einsum("knc,nd->kcd", solve.reshape(4, -1, channels), solver.reader.black_weights) ** 2
         dark = (drive @ solver.black_variance).sum(axis=1)
-        errors = np.sqrt(solve**2 @ variance * over + dark[:, None]).astype(np.float32)
+        errors = np.sqrt(solve**2 @ variance * variance_ratio + dark[:, None]).astype(np.float32)
         stokes[~self.is_determined], errors[~self.is_determined] = np.nan, np.nan
         return {"stokes": stokes, "stokes_errors": errors}

@@ -12,7 +12,7 @@ from processing.storage.products.product import Product, Step
 SHAPE, READ, LIGHT = (24, 32), 3.0, 600.0
 
 
-def pulls(synthetic_capture, configs, out, states, angles_deg, is_unlike=None):
+def pulls(synthetic_capture, configs, out, states, angles_deg, is_unlike=None, is_masked=None):
     """Errors of a Stokes image over its error bars (4, rows, columns); of `is_unlike` pixels the light flickers."""
     random = np.random.default_rng(states)
     rows = [(mueller.polarizer(0.0) @ mueller.retarder(np.deg2rad(a), np.deg2rad(131.8)))[0] for a in angles_deg]
@@ -20,6 +20,8 @@ def pulls(synthetic_capture, configs, out, states, angles_deg, is_unlike=None):
     frames = random.poisson(np.tensordot(rows, light, axes=1)) + random.normal(0, READ, (states, *SHAPE)) + 100
     if is_unlike is not None:
         frames[:, is_unlike] *= random.uniform(0.7, 1.3, (states, np.sum(is_unlike)))
+    if is_masked is not None:
+        frames[:, is_masked] = 100
     frames = np.round(frames).astype(np.uint16)[:, None]
     path = synthetic_capture(frames, {"psa": angles_deg}, detector={"black_level_counts": 100, "bits": 16})
     model = InstrumentModel.load(configs / "instruments/rotating_retarder_stokes.yaml").at(662)
@@ -45,3 +47,11 @@ def test_pixels_whose_light_is_not_constant_have_errors_of_their_own(synthetic_c
     off = pulls(synthetic_capture, configs, tmp_path / "m.h5", 24, angles_deg, is_unlike)
     assert np.mean(np.abs(off[:, is_unlike]) < 1.96) == pytest.approx(0.95, abs=0.05)
     assert np.mean(np.abs(off[:, ~is_unlike]) < 1.96) == pytest.approx(0.95, abs=0.03)
+
+
+def test_a_background_without_counts_leaves_the_errors_of_the_rest(synthetic_capture, configs, tmp_path):
+    """Frames that were masked before they came: where there is neither light nor noise, nothing tells a share."""
+    is_masked = np.zeros(SHAPE, bool)
+    is_masked[:, :12] = True
+    off = pulls(synthetic_capture, configs, tmp_path / "m.h5", 16, 4 + 11.25 * np.arange(16), is_masked=is_masked)
+    assert np.mean(np.abs(off[:, ~is_masked]) < 1.96) == pytest.approx(0.95, abs=0.03)

@@ -36,7 +36,7 @@ class MuellerSolver:
         self.first_square = len(inversion.pinv) + len(inversion.null)
         black = reader.correction.black
         # Residuals tell the noise of light; what darks have they tell themselves.
-        camera = noise if noise is not None and noise.own is None else None
+        camera = noise if noise is not None and noise.residual_share is None else None
         excess = np.repeat(black.excess(camera, reader.exposure_s), channels)
         #: Variance without light of each intensity (N,), counts^2.
         self.intensity_floor = (
