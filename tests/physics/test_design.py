@@ -17,7 +17,7 @@ from processing.calibration.state_design import (
 )
 from processing.commands.application import app
 from processing.errors import ProcessError
-from processing.instrument.model import InstrumentModel
+from processing.instrument.model import InstrumentModel, rank
 from processing.instrument.states import rotating_retarders
 
 NOISE = AssumedNoise(electrons=20_000, read_noise_e=3)
@@ -42,6 +42,12 @@ def test_ratio_five_with_forty_steps_has_rank_12() -> None:
     figures = score(MODEL.rows(rotating_retarders(0.1, ratio=5.0).angles_deg), NOISE)
     assert figures.rank == 12
     assert figures.equally_weighted_variance == np.inf
+
+
+def test_the_instrument_of_ratio_five_needs_other_steps(configs: Path) -> None:
+    model = InstrumentModel.load(configs / "instruments/drr_5to1.yaml")
+    assert rank(model.rows(rotating_retarders(1.0, 40, 9.0, 5.0).angles_deg)) == 12
+    assert rank(model.rows(rotating_retarders(1.0, 30, 6.0, 5.0).angles_deg)) == 16
 
 
 def test_ideal_rows_are_those_of_the_instrument_model() -> None:

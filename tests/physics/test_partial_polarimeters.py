@@ -357,15 +357,6 @@ def test_what_needs_the_whole_matrix_says_so(noisy, configs, tmp_path):
         assert product_figure(product)
 
 
-def test_five_to_one_needs_steps_over_half_a_turn(configs):
-    model = InstrumentModel.load(configs / "instruments/drr_5to1.yaml")
-    from processing.instrument.model import rank
-    from processing.instrument.states import rotating_retarders
-
-    assert rank(model.rows(rotating_retarders(1.0, 40, 9.0, 5.0).angles_deg)) == 12
-    assert rank(model.rows(rotating_retarders(1.0, 30, 6.0, 5.0).angles_deg)) == 16
-
-
 @pytest.mark.parametrize("name", ["linear_mueller", "polarization_camera_retarder"])
 def test_a_known_sample_calibrates_the_train(name, synthetic_capture, configs):
     nominal = InstrumentModel.load(configs / f"instruments/{name}.yaml")
