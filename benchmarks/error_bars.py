@@ -17,8 +17,8 @@ import numpy as np
 from noisy_images import nineteen_samples, noisy_image, seven_instruments
 from scipy.stats import norm
 
-from processing.maps.intervals import ANGLES_OF, SIGNED, whole_range
 from processing.maps.quantities import EXTRA, quantities_block
+from processing.maps.ranges import ANGLES_OF, SIGNED, whole_range
 from processing.maps.xi0 import eigenvalue_block
 from processing.polarization.magnitude import NORMAL_95
 from processing.polarization.quantities import PAPER_PAIRS

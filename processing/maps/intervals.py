@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from processing.arrays import Array, RealArray
+from processing.maps.ranges import ANGLES_OF, DIFFERENTIAL, EITHER_AXIS, SIGNED, whole_range
 from processing.polarization.magnitude import NORMAL_95, directions, interval, sum_of_singular_values
 from processing.polarization.propagation import Derived
-from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.vector_noise import VectorNoise, of_elements, of_slopes
 from processing.reduction.systematic import Systematic
 from processing.storage.products.images import MuellerImage
@@ -34,43 +34,6 @@ ONE_SIDE_95 = 1.644854
 LEAST_M00 = 5.0
 #: A rotation is determined where the weakest factor that it is divided by is this many times its noise.
 SEEN = 3.0
-EITHER_AXIS = "retardance_axis_or_90_deg"
-#: Angles whose range is all directions, by the length of the vector that they are the angle of.
-ANGLES_OF = {
-    **{
-        f"{name}_linear": (f"{name}_orientation_deg",)
-        for name in ("diattenuation", "polarizance", "dominant_diattenuation", "dominant_polarizance")
-    },
-    "retardance_linear_deg": ("retardance_fast_axis_deg", EITHER_AXIS),
-    "differential_retardance_linear_deg": ("differential_retardance_fast_axis_deg",),
-}
-ANGLES = tuple(angle for each in ANGLES_OF.values() for angle in each)
-#: Ranges of what the differential decomposition gives; where it does not exist any of them may be.
-DIFFERENTIAL = {
-    "retardance_deg": (0.0, 180.0),
-    "retardance_linear_deg": (0.0, 180.0),
-    "retardance_fast_axis_deg": (0.0, 180.0),
-    "retardance_circular_deg": (-180.0, 180.0),
-    "diattenuation_linear": (0.0, np.inf),
-    **{f"depolarization_{k}": (-np.inf, np.inf) for k in (1, 2, 3)},
-}
-SIGNED = ("retardance_circular_deg", "retardance_vector_deg")
-#: What a quantity can be, by the end of its name; of angles see `set_ratios`.
-RANGES: tuple[tuple[str, tuple[float, float] | tuple[tuple[float, ...], tuple[float, ...]]], ...] = (
-    *((f"differential_{short}", bounds) for short, bounds in DIFFERENTIAL.items()),
-    *((f"retardance_{part}deg", (0.0, 180.0)) for part in ("", "linear_")),
-    *((name, (-180.0, 180.0)) for name in SIGNED),
-    ("ellipticity_deg", (-45.0, 45.0)),
-    ("xi0", (0.25, 1.0)),
-    ("coherency_eigenvalues", ((0.25, 0.0, 0.0, 0.0), (1.0, 1 / 2, 1 / 3, 1 / 4))),
-    ("eigenvalue_deviation", (-1 / 3, 1 / 3)),
-    *((name, (0.0, 2.0)) for name in PAPER_PAIRS),
-    ("_circular", (-1.0, 1.0)),
-    *((f"symmetric_d{k}", (-1.0, 1.0)) for k in (1, 2, 3)),
-    ("dominant_mueller_jones", (-1.0, 1.0)),
-    *((name, (0.0, 1.0)) for name in ("entropy", "td_missed", "diattenuation", "polarizance", "_linear", "_purity")),
-    *((f"depolarization_{part}", (0.0, 1.0)) for part in ("index", "power")),
-)
 #: Relative error of m00 from which on the ratio to it has an interval of its own: below, that would change the longest
 #: one by a hundredth.
 UNEVEN = 0.03
@@ -215,17 +178,6 @@ def over_m00(sides: Array, u: Array, shared: Array, deviate: float) -> Array:
         most = deviate * u * np.abs(sides)
         turn = np.clip(deviate**2 * shared, -most, most)
         return np.asarray((np.sign(sides) * np.sqrt(turn**2 + sides**2 * denominator) - turn) / denominator)
-
-
-def whole_range(name: str, value: Array) -> tuple[Array, Array]:
-    """Range of a quantity, (...) each; for an angle one period about the value."""
-    if name in ANGLES:
-        half = 45.0 if name == EITHER_AXIS else 90.0
-        middle = np.where(np.isfinite(value), value, half)
-        return middle - half, middle + half
-    low, high = next((np.array(ends) for end, ends in RANGES if name.endswith(end)), np.array([-np.inf, np.inf]))
-    grow = (slice(None),) * np.ndim(low) + (None,) * (value.ndim - np.ndim(low))
-    return np.broadcast_to(low[grow], value.shape), np.broadcast_to(high[grow], value.shape)
 
 
 def moves_of(systematic: Systematic, image: MuellerImage, *, is_held: bool = True) -> Array:

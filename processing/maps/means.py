@@ -19,9 +19,9 @@ from scipy.special import stdtrit
 from processing.arrays import Array
 from processing.errors import ProcessError
 from processing.instrument.uncertainty import align_inputs
-from processing.maps.intervals import ANGLES, EITHER_AXIS
 from processing.maps.partial_quantities import determined_maps, partial_block
 from processing.maps.quantities import quantities_block
+from processing.maps.ranges import ANGLES, EITHER_AXIS
 from processing.maps.stokes_vector import is_first_column, light_of, light_quantities, moves_of_light, rename_planes
 from processing.polarization.magnitude import NORMAL_95
 from processing.polarization.quantities import PAPER_PAIRS
