@@ -133,8 +133,9 @@ def difference(request: Request) -> Response:
         scales=[{"colours": s.colours, "low": s.low, "high": s.high} for s in scales],
         units=units_words(units),
         rms=_rms(deviation),
-        rms_noise=_rms(noise),
-        rms_systematic=_rms(np.asarray(systematic)),
+        # Errors of the pixels that have a deviation: an unlit pixel has none.
+        rms_noise=_rms(noise + 0 * deviation),
+        rms_systematic=_rms(systematic + 0 * deviation),
         rms_over=_rms(significance),
     )
 

@@ -65,8 +65,9 @@ def test_options_that_do_not_fit_are_told_before_the_work_and_not_passed_over(ru
 
 
 def test_a_place_for_no_file_is_refused_before_the_work(acquire, small_rig, capture, configs, capfd):
-    code, _, err = acquire("--omega", 35, "--rig", small_rig(), "--out", capture)
-    assert (code, f"{capture} is a file, and captures need a folder" in err) == (2, True)
+    rig = small_rig()
+    for place, words in ((capture, f"--out {capture} would be a folder"), (rig, f"{rig} is a file, and captures")):
+        assert words in acquire.refused("--omega", 35, "--rig", rig, "--out", place)
     for command in (("snap", "--out", "no/frame.png"), ("init", "--out", "no/rig.yaml")):
         assert "there is no folder no. Make it" in acquire.refused(*command)
     instrument = configs / "instruments/rgb950.yaml"
