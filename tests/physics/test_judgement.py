@@ -137,6 +137,20 @@ def test_a_direction_that_was_not_seen_before_makes_no_condition_worse():
     before = np.diag([*np.ones(12), *np.zeros(4)])
     seen = before + np.diag([*np.zeros(12), *np.full(4, 1e-3)])
     worse = before - np.diag([*np.zeros(11), 0.9, *np.zeros(4)])
-    assert [check.holds for check in rows_checks("air", before, seen)] == [True, True]
-    assert [check.holds for check in rows_checks("air", before, worse)] == [True, False]
-    assert [check.holds for check in rows_checks("air", seen, before)] == [False, False]
+    assert [check.holds for check in rows_checks([("air", before, seen)])] == [True, True]
+    assert [check.holds for check in rows_checks([("air", before, worse)])] == [True, False]
+    assert [check.holds for check in rows_checks([("air", seen, before)])] == [False, False]
+
+
+def test_the_matrix_of_one_wavelength_of_three_may_lose_a_direction():
+    """The plates of a telescope's polarimeter leave 15 directions near 1329 nm; all its wavelengths were refused."""
+    whole = np.diag([*np.ones(15), 1e-3])
+    poor = np.diag([*np.ones(15), 1e-7])
+    figures = rows_checks([("1283 nm", whole, whole), ("1329 nm", whole, poor), ("1380 nm", whole, whole)])
+    assert all(check.holds for check in figures)
+    assert (figures[2].before, figures[2].after) == (16, 15)
+    figures = rows_checks([("1283 nm", whole, poor), ("1329 nm", whole, poor), ("1380 nm", whole, whole)])
+    assert [check.name for check in figures if not check.holds] == [
+        "rank of the measurement matrix of the captures, median",
+        "condition of the measurement matrix of the captures, median",
+    ]

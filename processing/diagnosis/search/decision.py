@@ -5,7 +5,7 @@ No correction is written that makes a measurement worse: figures before and afte
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,21 +31,32 @@ def held_out_check(solved: Solution, stretch: float = 1.0) -> Check:
     )
 
 
-def rows_checks(name: str, before: Array, after: Array) -> tuple[Check, Check]:
-    """Rank and condition of a measurement matrix W (L, 16) without and with a correction."""
-    sizes = [np.linalg.svd(w, compute_uv=False) for w in (before, after)]
-    rank, new_rank = (int(np.sum(size > MEASURED * size[0])) for size in sizes)
-    # A direction that the correction adds may be seen poorly: it was not seen at all before.
-    condition, new_condition = (float(size[0] / max(size[rank - 1], 1e-300)) for size in sizes)
+def rows_checks(captures: Sequence[tuple[str, Array, Array]]) -> tuple[Check, ...]:
+    """Rank and condition of the measurement matrix W (L, 16) of each capture, by name, without and with a correction.
+
+    The median over several captures decides. Near one wavelength the true W of an instrument may have no full rank.
+    """
+    figures: list[Check] = []
+    for name, *matrices in captures:
+        sizes = [np.linalg.svd(w, compute_uv=False) for w in matrices]
+        rank, new_rank = (int(np.sum(size > MEASURED * size[0])) for size in sizes)
+        # A direction that the correction adds may be seen poorly: it was not seen at all before.
+        condition, new_condition = (float(size[0] / max(size[rank - 1], 1e-300)) for size in sizes)
+        figures += _rows_pair(name, (rank, new_rank), (condition, new_condition))
+    if len(captures) == 1:
+        return tuple(figures)
+    ranks, conditions = (np.median([(c.before, c.after) for c in figures[k::2]], axis=0).tolist() for k in (0, 1))
+    decisive = _rows_pair("the captures, median", ranks, conditions)
+    return *(c.model_copy(update={"holds": True}) for c in figures), *decisive
+
+
+def _rows_pair(name: str, ranks: Sequence[float], conditions: Sequence[float]) -> tuple[Check, Check]:
     where = f"of the measurement matrix of {name}"
+    (rank, new_rank), (condition, new_condition) = ranks, conditions
+    holds = bool(new_condition <= WORSE_CONDITION * condition)
     return (
-        Check(name=f"rank {where}", before=rank, after=new_rank, holds=new_rank >= rank),
-        Check(
-            name=f"condition {where}",
-            before=condition,
-            after=new_condition,
-            holds=bool(new_condition <= WORSE_CONDITION * condition),
-        ),
+        Check(name=f"rank {where}", before=rank, after=new_rank, holds=bool(new_rank >= rank)),
+        Check(name=f"condition {where}", before=condition, after=new_condition, holds=holds),
     )
 
 

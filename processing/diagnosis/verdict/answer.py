@@ -269,16 +269,17 @@ def unobservable(problem: DiagnosisProblem, posterior: Posterior) -> list[Candid
 def checks(problem: DiagnosisProblem, solved: Solution) -> tuple[Check, ...]:
     """Held-out residual, rank and condition of W, before and after: if one gets worse, it is no explanation."""
     figures = [held_out_check(solved, stretch(problem, solved))]
-    several = len(problem.captures) > 1
+    several, rows = len(problem.captures) > 1, []
     for k, data in enumerate(problem.captures):
         if several:
             # The sum decides; what became of each is told also where nothing is written.
             old, new = (100 * held_out.of(k).rms for held_out in (solved.before, solved.after))
             name = f"rms on held-out data of {data.name} at {data.wavelength_nm:g} nm, percent"
             figures.append(Check(name=name, before=old, after=new, holds=True))
+        where = f"{data.name} at {data.wavelength_nm:g} nm" if several else data.name
         before, after = (problem.rows(k, space, fit.values) for space, fit in solved.ends)
-        figures += rows_checks(data.name, before, after)
-    return tuple(figures)
+        rows.append((where, before, after))
+    return *figures, *rows_checks(rows)
 
 
 @dataclass(frozen=True)
