@@ -125,6 +125,8 @@ def difference(request: Request) -> Response:
     noise = np.hypot(slopes[0] * plane_a[1], slopes[1] * plane_b[1]) if shared is None else shared
     with np.errstate(divide="ignore", invalid="ignore"):
         significance = deviation / np.hypot(noise, systematic)
+    # An unlit pixel has no deviation, and an arbitrary error.
+    is_compared = np.isfinite(deviation)
     wide = scale_of("deviation", "", deviation)
     scales = [scale, scale, wide, ColourScale(SIGNED, -ERRORS_SHOWN, ERRORS_SHOWN)]
     return plane_response(
@@ -133,9 +135,8 @@ def difference(request: Request) -> Response:
         scales=[{"colours": s.colours, "low": s.low, "high": s.high} for s in scales],
         units=units_words(units),
         rms=_rms(deviation),
-        # Errors of the pixels that have a deviation: an unlit pixel has none.
-        rms_noise=_rms(noise + 0 * deviation),
-        rms_systematic=_rms(systematic + 0 * deviation),
+        rms_noise=_rms(np.where(is_compared, noise, np.nan)),
+        rms_systematic=_rms(np.where(is_compared, systematic, np.nan)),
         rms_over=_rms(significance),
     )
 
