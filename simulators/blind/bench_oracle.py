@@ -16,7 +16,8 @@ from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.captures.screening import screen_capture
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.fit import PRIOR_WIDTH, minimize
+from processing.diagnosis.search.fit import minimize
+from processing.diagnosis.search.rules import NOMINAL_TAU
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.storage.captures.capture import Capture
@@ -65,7 +66,7 @@ def read_oracle(folder: Path, truth: RealBench, configs: Path, capture_set: str)
 
 
 def _set_prior_width(candidate: Candidate) -> Candidate:
-    width = PRIORS[candidate.kind].rms / PRIOR_WIDTH
+    width = PRIORS[candidate.kind].rms / NOMINAL_TAU
     return replace(candidate, parameters=tuple(replace(p, typical=width) for p in candidate.parameters))
 
 

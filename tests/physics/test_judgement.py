@@ -57,9 +57,9 @@ def test_where_no_pixel_shows_xi0_nothing_is_said_of_it(monkeypatch) -> None:
     fit = Fit(np.ones(1), Sums.empty(1, 1), 0.0)
     solved = Solution(Space(()), fit, None, Space((candidate,)), fit, None)
     problem = SimpleNamespace(captures=[None])
-    monkeypatch.setattr(quantities, "xi0_of", lambda *of: np.full(5, np.nan))
+    monkeypatch.setattr(quantities, "_all_xi0", lambda *of: np.full(5, np.nan))
     assert quantities.chances(problem, solved, np.eye(1)) == ()
-    monkeypatch.setattr(quantities, "xi0_of", lambda problem, k, space, values: np.append(0.1 * values, np.nan))
+    monkeypatch.setattr(quantities, "_all_xi0", lambda problem, space, values: np.append(0.1 * values, np.nan))
     change = quantities.change_of_xi0(problem, solved, 0.01 * np.eye(1))
     assert (change.size, change.stderr) == pytest.approx((0.1, 0.0071), abs=1e-4)
 

@@ -58,8 +58,8 @@ def rounding(sums):
 def test_single_precision_in_strips_is_what_double_says(capture, monkeypatch, threads):
     _, double = excess(*capture)
     monkeypatch.setenv("UMOV_THREADS", threads)
-    monkeypatch.setattr(pixel_sums, "MANY_PX", 0)
-    monkeypatch.setattr(pixel_sums, "NOISE_OF_SINGLE", 0.0)
+    monkeypatch.setattr(pixel_sums, "ENOUGH_PX", 1000)
+    monkeypatch.setattr(pixel_sums, "LEAST_NOISE", 0.0)
     monkeypatch.setattr(pixel_sums, "STRIP_PX", 20 * COLUMNS)
     _, single = excess(*capture)
     assert np.all(np.abs(double.excess) < 6 * np.sqrt(2 * double.freedom))
@@ -69,7 +69,7 @@ def test_single_precision_in_strips_is_what_double_says(capture, monkeypatch, th
 
 def test_without_turning_the_rows_single_precision_would_not_do(capture, monkeypatch):
     _, double = excess(*capture)
-    monkeypatch.setattr(pixel_sums, "MANY_PX", 0)
+    monkeypatch.setattr(pixel_sums, "ENOUGH_PX", 1000)
     monkeypatch.setattr(pixel_sums.Pixels, "basis", np.eye(STATES))
     _, single = excess(*capture)
     assert np.all(np.abs(single.excess - double.excess) > 100 * rounding(double))

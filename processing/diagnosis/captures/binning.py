@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.diagnosis.captures.capture_data import CaptureData, SharedNoise
+from processing.diagnosis.captures.capture_data import CaptureData, SharedNoise, mixed_part
 
 #: [intensities] Of a capture that are fitted; more are averaged over squares of pixels.
 MOST_FITTED = 5_000_000
@@ -45,14 +45,17 @@ def averaged_for_fits(data: CaptureData) -> CaptureData:
 def averaged(data: CaptureData, side: int) -> CaptureData:
     """Means over squares of so many pixels a side, of a capture of which nothing was undone or moved back yet.
 
-    A square counts if all of its pixels do, and is clipped if one of them is.
+    A square counts if all of its pixels do, and is clipped if one of them is. Its neighbours share less noise than
+    those of pixels do, lines more.
     """
+    shared = data.shared
+    right, down = (mixed_part(part * (1 - part) / side) for part in (shared.right, shared.down))
     return replace(
         data,
         signal=means(data.signal, side),
         slope=data.slope / side**2,
         floor=data.floor / side**2,
-        shared=_shared(data.shared, side),
+        shared=SharedNoise(right, down, shared.rows * side, shared.columns * side),
         clipped=_any(data.clipped, side),
         usable=~_any(~data.usable, side),
         steep=None if data.steep is None else _any(data.steep, side),
@@ -63,20 +66,3 @@ def averaged(data: CaptureData, side: int) -> CaptureData:
 
 def _any(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
     return np.asarray(squares(mask, side).any(axis=(-3, -1)))
-
-
-def _shared(shared: SharedNoise, side: int) -> SharedNoise:
-    """Shared noise of squares: neighbours share less than pixels do, lines more."""
-    return replace(
-        shared,
-        right=_mixed(shared.right, side),
-        down=_mixed(shared.down, side),
-        rows=shared.rows * side,
-        columns=shared.columns * side,
-    )
-
-
-def _mixed(part: float, side: int) -> float:
-    """Part m of the next square that is mixed into each: the covariance m (1 - m) of neighbours goes with 1 / side."""
-    product = part * (1 - part) / side
-    return float((1 - np.sqrt(1 - 4 * product)) / 2)

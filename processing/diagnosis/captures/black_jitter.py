@@ -13,9 +13,6 @@ from processing.diagnosis.search.rules import FEWEST_PIXELS, MOSTLY, NOISE_SURE,
 from processing.instrument.grammar import TIMES, course
 from processing.reduction.noise import QUANTIZATION
 
-#: [of the median] Brightness from which on a pixel is lit.
-LIT = 0.5
-
 
 def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
     """Offset (L,) of every row, as far as it is not what the light of a pixel could be, and the variance of the whole.
@@ -29,7 +26,7 @@ def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
     lit = data.usable & ~data.clipped
     if not lit.any():
         return None
-    lit &= mean > LIT * np.median(mean[lit])
+    lit &= mean > MOSTLY * np.median(mean[lit])
     dim = np.any(y != 0, axis=0) & (mean < SMALL * mean[lit].mean())
     _, outside = inside_and_outside(a[rows])
     free = outside.shape[1]

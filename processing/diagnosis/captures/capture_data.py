@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.computing.threads import for_ranges
-from processing.instrument.changes import Conditions
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.model import InstrumentModel
 from processing.reduction.move_image import shifted_back
 
 #: Corrected counts of signals (N, channels, rows, columns), and their slope over the old ones.
@@ -38,6 +39,11 @@ class SharedNoise:
     def shown(self) -> float:
         """Variance of a pixel over that before pixels were mixed."""
         return (1 - 2 * self.right * (1 - self.right)) * (1 - 2 * self.down * (1 - self.down))
+
+
+def mixed_part(covariance: float) -> float:
+    """Part m of the next pixel that was mixed into each, of the covariance m (1 - m) of neighbours."""
+    return float((1 - np.sqrt(1 - 4 * covariance)) / 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +180,11 @@ class CaptureData:
         """(N, channels, 2) by how much each frame has moved against the middle of its super-pixels."""
         place = np.zeros((self.signal.shape[1], 2)) if self.place_px is None else self.place_px
         return np.asarray(shift_px[:, None] - place)
+
+    def rows_of(self, model: InstrumentModel, changes: Changes | None = None) -> Array:
+        """Rows (values_per_pixel, K) that the light of a pixel reaches: all 16 columns of W, one of a known sample."""
+        w = model.rows(self.conditions.angles_deg, changes).reshape(-1, 16) * self.row_exposure[:, None]
+        return w if self.sample is None else (w @ self.sample)[:, None]
 
     def variance(self, rows: slice = slice(None)) -> Array:
         """Variance (N, channels, rows, columns) in full scale squared; right on average over noisy signals.

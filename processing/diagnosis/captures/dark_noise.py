@@ -8,17 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.calibration.known_sample import known_mueller
 from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.search.range_of import inside_and_outside
-from processing.diagnosis.search.rules import OUTSTANDING
+from processing.diagnosis.search.rules import LITTLE, OUTSTANDING
 from processing.instrument.model import InstrumentModel
 from processing.reduction.black import Black
-from processing.reduction.measurement_matrix import measurement_matrix
 from processing.storage.captures.capture import Capture
-
-#: [of the noise of one state] Noise of the dark frames, over all states of a pixel, that changes nothing.
-UNSEEN = 1e-3
 
 
 def without_noise_of_darks(
@@ -55,9 +50,11 @@ def without_noise_of_darks(
     dark = (
         np.kron(black.weights(capture.column("exposure_s")[states]) * dark_sd, np.eye(channels))[counts] / sd[:, None]
     )
-    inside, outside = inside_and_outside(_rows(capture, model, states)[counts] / sd[:, None])
+    rows = data.rows_of(model.model_copy(update={"effects": ()}))
+    inside, outside = inside_and_outside(rows[counts] / sd[:, None])
     u, size, errors = np.linalg.svd(outside @ (outside.T @ dark), full_matrices=False)
-    visible = size > UNSEEN
+    # Over all states of a pixel, in units of the noise of one.
+    visible = size > LITTLE
     if not visible.any():
         return data
     u, size, in_light = u[:, visible], size[visible, None], inside @ (inside.T @ (dark @ errors[visible].T))
@@ -71,7 +68,9 @@ def without_noise_of_darks(
         # Channels that look at places apart differ by the slopes of the light, in all states alike.
         images = np.tensordot((inside.T / sd).astype(np.float32), y[counts], 1)
         light = np.concatenate([light, *(slope[:, good] for slope in np.gradient(images, axis=(1, 2)))])
-    of_dark = _project_out(residual, light)
+    # Without the mean over the pixels, and without the part that follows their light.
+    basis = np.concatenate([np.ones_like(light[:1]), light])
+    of_dark = np.asarray(residual - (residual @ np.linalg.pinv(basis)) @ basis, dtype=float)
     # A pixel with a hit, or a hot one, tells nothing of its dark frames.
     of_dark[np.abs(of_dark) > OUTSTANDING] = 0.0
     subtracted = np.zeros((len(y), of_dark.shape[1]), dtype=np.float32)
@@ -79,15 +78,3 @@ def without_noise_of_darks(
     signal = data.signal.copy()
     signal.reshape(y.shape)[:, good] -= subtracted
     return replace(data, signal=signal)
-
-
-def _rows(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> Array:
-    """Columns (N x channels, K) that the light of a pixel reaches: all of W, or those of a known sample."""
-    w = measurement_matrix(capture, model.model_copy(update={"effects": ()}), states).reshape(-1, 16)
-    return w if capture.header.sample.kind == "unknown" else w @ known_mueller(capture.header.sample).reshape(16, 1)
-
-
-def _project_out(values: Array, light: Array) -> Array:
-    """Values (B, P) of the pixels without their mean and without the part that follows their light (K, P)."""
-    basis = np.concatenate([np.ones_like(light[:1]), light])
-    return np.asarray(values - (values @ np.linalg.pinv(basis)) @ basis, dtype=float)

@@ -12,11 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from processing.arrays import Array
+from processing.diagnosis.captures.binning import MOST_FITTED
 from processing.diagnosis.captures.black_jitter import black_jitter
-from processing.diagnosis.captures.capture_data import CaptureData, SharedNoise
+from processing.diagnosis.captures.capture_data import CaptureData, SharedNoise, mixed_part
 from processing.diagnosis.captures.outliers import Whitened
+from processing.diagnosis.search.range_of import NEARLY_ZERO
 from processing.diagnosis.search.rules import (
     DARK_NOISE_OFF,
+    LEAST_PART,
+    LITTLE,
     NOISE_OFF,
     NOISE_SURE,
     SHOWN,
@@ -35,30 +39,8 @@ LINES_APART = 2
 #: [1] Deviation of the variance of a pixel that is told where neighbours share noise: what a pixel shows of it is not
 #: known better.
 NOISE_OFF_MIXED = 0.15
-#: [correlation] Of neighbours, from which on they share noise.
-NOISE_ALIKE = 0.05
-
-#: [intensities] Of the image that are looked at: enough for a part in a thousand of the noise.
-MOST_VALUES = 4_000_000
-#: [of what is declared] Least part of the variance that weights are made of.
-LEAST_PART = 0.01
-#: [of the signal] Scatter of pixels below which it is that of rounded numbers.
-ROUNDING = 1e-6
-#: [of the variance of a wide pattern] What rounding adds, below which it changes nothing.
-ROUNDING_SEEN = 1e-3
-#: [unit of chi-square] Weight of the belief that both parts of the noise are as declared, where the images do not tell
-#: them apart.
-WEAK = 1e-3
-#: [1] Largest factor on the gain that is tried, and one over the least.
-MOST_GAIN = 10.0
-#: [factors] On the gain that are tried: steps of a percent.
-GAINS = 400
-#: [1] Least factor on the variance without light that is tried.
-LEAST_DARK_FACTOR = 0.01
-#: [1] Largest factor on the variance without light that is tried.
-MOST_DARK_FACTOR = 400.0
-#: [factors] On the variance without light that are tried: steps of a percent.
-DARKS = 800
+#: [1] Factors on the gain, or on the variance without light, that are tried: steps of a percent.
+FACTORS = np.geomspace(0.01, 400.0, 1000).tolist()
 
 
 @dataclass(frozen=True)
@@ -100,7 +82,7 @@ def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
     height, width = data.usable.shape
     if min(height, width) < NARROWEST:
         return None
-    rows = min(height, max(NARROWEST, MOST_VALUES // (width * data.values_per_pixel)))
+    rows = min(height, max(NARROWEST, MOST_FITTED // (width * data.values_per_pixel)))
     part = slice((height - rows) // 2, (height - rows) // 2 + rows)
     looked_at = np.zeros(data.usable.shape, dtype=bool)
     looked_at[part] = (data.usable & ~data.clipped)[part]
@@ -117,7 +99,7 @@ def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
     dark[:, good] = (projector**2 @ floor)[:, None]
     light[:, good] = projector**2 @ white.variance - dark[:, good]
     scatter = np.sqrt(_half_square(r, light + dark, NOT_ALIKE_PX, 2)) * white.level.mean()
-    if not scatter > ROUNDING * float(np.mean(np.abs(data.signal[..., part, :]))):
+    if not scatter > NEARLY_ZERO * float(np.mean(np.abs(data.signal[..., part, :]))):
         raise CaptureError(
             f"{data.name}: its frames have no noise: neighbouring pixels differ by less than numbers are rounded. "
             "`diagnose` weighs each difference by the noise. Give frames of a camera, or add noise to calculated ones."
@@ -205,8 +187,9 @@ def _levels(r: Array, light: Array, dark: Array, free: float) -> tuple[float, fl
     factors = np.ones(2)
     for _ in range(3):
         weight = 1 / (design @ np.maximum(factors, LEAST_PART)) ** 2
-        normal = (design * weight[:, None]).T @ design + WEAK * np.eye(2)
-        factors = np.linalg.solve(normal, (design * weight[:, None]).T @ half[used] + WEAK)
+        # Where the images do not tell both parts apart, both are as declared.
+        normal = (design * weight[:, None]).T @ design + LITTLE * np.eye(2)
+        factors = np.linalg.solve(normal, (design * weight[:, None]).T @ half[used] + LITTLE)
     # A difference has the noise of two pixels, and each pixel is in two of them.
     return float(factors[0]), float(factors[1]), np.asarray(3 * normal.shape[0] / 2 / free * np.linalg.inv(normal))
 
@@ -255,14 +238,10 @@ def _noise_note(text: str, variance: float, data: CaptureData) -> str:
 
 
 def _shared_by_neighbours(noise: DetectorNoise) -> SharedNoise:
-    least = max(NOISE_ALIKE, NOISE_SURE * noise.alike_error)
-    return SharedNoise(*(_part(alike) if alike > least else 0.0 for alike in (noise.right, noise.down)))
-
-
-def _part(alike: float) -> float:
-    """Part of the next pixel that was mixed in, from the correlation of neighbours: m (1 - m) / (1 - 2 m (1 - m))."""
-    product = min(alike / (1 + 2 * alike), 0.25)
-    return float((1 - np.sqrt(1 - 4 * product)) / 2)
+    least = max(SMALL, NOISE_SURE * noise.alike_error)
+    # The correlation of neighbours is m (1 - m) / (1 - 2 m (1 - m)).
+    parts = (mixed_part(min(c / (1 + 2 * c), 0.25)) if c > least else 0.0 for c in (noise.right, noise.down))
+    return SharedNoise(*parts)
 
 
 def _wide(shared: SharedNoise, data: CaptureData) -> Array:
@@ -273,7 +252,7 @@ def _wide(shared: SharedNoise, data: CaptureData) -> Array:
         return lines
     variance = data.variance_of(data.usable).mean(axis=(1, 2))
     rounding = data.usable.sum() * data.rounding / np.maximum(variance, data.floor)
-    return lines + np.where(rounding > ROUNDING_SEEN, rounding, 0.0)
+    return lines + np.where(rounding > LITTLE, rounding, 0.0)
 
 
 def _lines(shared: SharedNoise, data: CaptureData) -> tuple[float, float]:
@@ -302,13 +281,10 @@ def noise_factors(noise: DetectorNoise, shown: float, estimated: bool) -> tuple[
     if _distance(factors, usual, inverse) < NOISE_SURE**2 or not (far or _dark_is_off(noise, shown)):
         return usual
     # As simple as the images allow: another gain, another read noise, both.
-    scales = np.geomspace(1 / MOST_GAIN, MOST_GAIN, GAINS)
-    gain = min(((s, s**2) for s in scales), key=lambda p: _distance(factors, p, inverse))
-    darks = np.geomspace(LEAST_DARK_FACTOR, MOST_DARK_FACTOR, DARKS)
-    read = min(((1.0, d) for d in darks), key=lambda p: _distance(factors, p, inverse))
-    simple = min(gain, read, key=lambda p: _distance(factors, p, inverse))
+    gains, reads = ((s, s**2) for s in FACTORS), ((1.0, s) for s in FACTORS)
+    simple = min((*gains, *reads), key=lambda p: _distance(factors, p, inverse))
     if _distance(factors, simple, inverse) < SHOWN**2:
-        return float(simple[0]), float(simple[1])
+        return simple
     return _balance(noise, white, max(float(factors[1]), SMALL))
 
 

@@ -15,11 +15,12 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.special import ndtri
 
 from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData
-from processing.diagnosis.search.range_of import inside_and_outside, range_of
-from processing.diagnosis.search.rules import FEWEST_OF_MANY, MOSTLY, OUTSTANDING
+from processing.diagnosis.search.range_of import NEARLY_ZERO, inside_and_outside, range_of
+from processing.diagnosis.search.rules import ENOUGH_PX, FEWEST_OF_MANY, LITTLE, MOSTLY, OUTSTANDING
 
 #: [robust standard deviations] From which on an intensity is a hit: the largest of 10^9 normal ones is 6.1.
 HIT = 8.0
@@ -53,12 +54,8 @@ SUSPECTS_OF_EXCHANGE = 12
 #: [of the largest eigenvalue of noise] From which on a direction over the states is structure, which all pixels share.
 BEYOND_NOISE = 1.15
 
-#: [standard deviations, fixed] Median of absolute values of normal ones.
-NORMAL_MAD = 0.6745
-#: [pixels] That tell a standard deviation to half a percent.
-PIXELS_OF_SCALE = 50_000
-#: [of the largest] Least variance of a row in whose units it is: that of none is zero.
-LEAST_LEVEL = 1e-3
+#: [standard deviations] Median of absolute values of normal ones.
+NORMAL_MAD = float(ndtri(0.75))
 
 
 @dataclass(frozen=True)
@@ -85,7 +82,8 @@ class Whitened:
         y = data.signal.reshape(rows, -1)[np.ix_(keep, good.reshape(-1))]
         variance = data.variance_of(good).reshape(rows, -1)[keep].astype(np.float32)
         mean = np.mean(variance, axis=1, dtype=float)
-        level = np.sqrt(np.maximum(mean, LEAST_LEVEL * mean.max()))
+        # That of a row without any is zero.
+        level = np.sqrt(np.maximum(mean, LITTLE * mean.max()))
         y /= level[:, None].astype(np.float32)
         variance /= (level[:, None] ** 2).astype(np.float32)
         return cls(y, variance, level, *inside_and_outside(a[keep] / level[:, None]))
@@ -107,7 +105,7 @@ class Whitened:
 
 def robust_scale(r: NDArray[np.floating]) -> Array:
     """Robust standard deviation (L, 1) of every row; of many pixels some tell it."""
-    r = r[:, :: r.shape[1] // PIXELS_OF_SCALE + 1]
+    r = r[:, :: r.shape[1] // ENOUGH_PX + 1]
     return np.asarray(np.maximum(np.median(np.abs(r), axis=1, keepdims=True) / NORMAL_MAD, 1e-12))
 
 
@@ -213,10 +211,6 @@ class _Moments:
         return (BadFrame(i, misfit, j), BadFrame(j, misfit, i)) if misfit >= LEAST_MISFIT else ()
 
 
-#: [of the variance of a state] Least part that a fit leaves of it: that of none is zero.
-LEAST_FREE = 1e-6
-
-
 @dataclass(frozen=True)
 class Outliers:
     """Excluded data: `hits` (N, channels, rows, columns) single intensities, `bad` (rows, columns) pixels."""
@@ -278,7 +272,7 @@ def _hits(
         struck: list[int] = []
         selection: tuple[list[int], float] = ([], float(noisy[p]))
         while len(struck) < MOST_STRUCK:
-            free = np.maximum(np.diag(q), LEAST_FREE)
+            free = np.maximum(np.diag(q), NEARLY_ZERO)
             # One hit is strongest where it struck: so it goes with a projection, whatever the noise of each state.
             k = int(np.argmax(np.abs(residual) / np.sqrt(free)))
             far = abs(residual[k]) / np.sqrt(free[k]) / noise[k, p]

@@ -6,6 +6,7 @@ Only one frame is in memory as stored, so a large sensor takes no more memory th
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,12 @@ from processing.calibration.known_sample import known_mueller
 from processing.diagnosis.captures.binning import means, side_for, squares
 from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.captures.dark_noise import without_noise_of_darks
-from processing.diagnosis.captures.rounding import Rounding
+from processing.diagnosis.captures.rounding import Planes, Rounding
 from processing.diagnosis.captures.unstated_noise import estimated_noise
 from processing.diagnosis.search.rules import (
     FEWEST_PIXELS,
     LIMIT,
+    LITTLE,
     NOISE_SURE,
     OUTSTANDING,
 )
@@ -32,6 +34,7 @@ from processing.reduction.measurement_matrix import angles_of, relative_exposure
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
 from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.captures.frame_layout import Cells
 
 #: [pixels] Around dark ones that are left out too: image derivatives over 7 pixels do not tell there what a shift does.
 DARK_RIM = 4
@@ -41,7 +44,7 @@ MOST_CUT_OFF = 0.01
 MOST_READ = 20_000_000
 #: [intensities of a pixel] Beyond which few pixels are kept: second moments of the states would be larger than those.
 MANY_VALUES = 160
-#: [pixels] That are kept then.
+#: [pixels] That are kept then; of fewer, states are held out and not tiles of the image.
 FEW_PIXELS = 64
 
 
@@ -77,21 +80,21 @@ def read_frames(
     capture: Capture, model: InstrumentModel, states: NDArray[np.int64], correction: CountCorrection
 ) -> Frames:
     """Read some states of a capture one after the other, as `model` sees them."""
-    split = _Split(model)
+    planes_of = _planes_of(model)
     exposure = capture.column("exposure_s")[states].astype(float)
     level, has_zero = _clip_level(capture, correction), _cuts_off(capture)
     counts: list[NDArray[np.float32]] = []
     clipped: list[NDArray[np.bool_]] = []
     zero: list[NDArray[np.bool_]] = []
     share, tops, side = np.zeros(len(states)), [], 1
-    rounding, of_rounding = Rounding(capture, split.planes, correction.black), []
+    rounding, of_rounding = Rounding(capture, planes_of, correction.black), []
     for n, k in enumerate(states):
         frame = capture.frames(int(k)).astype(np.float32)
-        over = split.any_of(frame >= (np.inf if level is None else level))
-        under = split.any_of((frame <= 0) & has_zero)
+        over = np.asarray(planes_of(frame >= (np.inf if level is None else level)).any(axis=0))
+        under = np.asarray(planes_of((frame <= 0) & has_zero).any(axis=0))
         shift, unsure, ratio = rounding.of_frame(int(k), frame)
         frame -= correction.black.at(exposure[n])
-        planes = split.planes(frame if correction.flat is None else frame / correction.flat.response)
+        planes = planes_of(frame if correction.flat is None else frame / correction.flat.response)
         planes = planes + shift.astype(np.float32)[:, None, None] if shift.any() else planes
         of_rounding.append((unsure.max(), ratio.mean()))
         side = _side(len(states) * len(planes), *planes.shape[1:])
@@ -115,30 +118,17 @@ def read_frames(
     )
 
 
-class _Split:
-    """The pixels of a mosaic apart by polarizer; a sensor without one is as it is."""
+def _planes_of(model: InstrumentModel) -> Planes:
+    """Function that makes frames (channels, rows, columns) of stored ones, which with a mosaic are one."""
+    if model.mosaic is None:
+        return lambda frames: frames
+    cells, rows, columns = Cells(model.mosaic, tuple(c.name for c in model.channels)), *np.shape(model.mosaic)
 
-    def __init__(self, model: InstrumentModel) -> None:
-        self._channels, self._mosaic = [c.name for c in model.channels], model.mosaic
+    def planes(frames: NDArray[Any]) -> NDArray[Any]:
+        height, width = frames.shape[1] // rows * rows, frames.shape[2] // columns * columns
+        return cells.split(frames[0, :height, :width])
 
-    def planes(self, frame: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Frames (channels, rows, columns) of stored ones, which are one with a mosaic."""
-        if self._mosaic is None:
-            return frame
-        cells = self._cells(frame[0])
-        where = {name: (r, c) for r, line in enumerate(self._mosaic) for c, name in enumerate(line)}
-        return np.stack([cells[:, where[name][0], :, where[name][1]] for name in self._channels])
-
-    def any_of(self, stored: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """True (rows, columns) where it is in some channel, or some pixel of a cell, of stored frames."""
-        mask = np.asarray(stored.any(axis=0))
-        return mask if self._mosaic is None else np.asarray(self._cells(mask).any(axis=(1, 3)))
-
-    def _cells(self, image: NDArray[np.generic]) -> NDArray[np.generic]:
-        assert self._mosaic is not None
-        rows, columns = len(self._mosaic), len(self._mosaic[0])
-        height, width = image.shape[0] // rows, image.shape[1] // columns
-        return image[: height * rows, : width * columns].reshape(height, rows, width, columns)
+    return planes
 
 
 def _side(values: int, height: int, width: int) -> int:
@@ -164,10 +154,6 @@ def _clip_level(capture: Capture, correction: CountCorrection) -> float | None:
         spread = OUTSTANDING * (detector.read_noise_e or 0.0) / detector.gain_e_per_count
         level = well - spread if level is None else min(level, well - spread)
     return level
-
-
-#: [of the mean signal] Noise that counts are weighted with where it is not known; what it is does not matter.
-SOME_NOISE = 1e-3
 
 
 def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
@@ -200,7 +186,8 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         exposure=exposure,
         sample=None if kind == "unknown" else known_mueller(capture.header.sample).reshape(16),
         slope=np.zeros(len(states)),
-        floor=np.full(len(states), (SOME_NOISE * float(np.mean(raw)) / top) ** 2),
+        # Where it is not known, what counts are weighted with does not matter.
+        floor=np.full(len(states), (LITTLE * float(np.mean(raw)) / top) ** 2),
         noise_known=False,
         noise_source="not known: too few pixels and no detector constants; the residual itself is the measure",
         clipped=frames.clipped,

@@ -7,19 +7,20 @@ of the numbers unless their spread is above about half a step.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from processing.arrays import Array
+from processing.diagnosis.search.rules import ENOUGH_PX
 from processing.reduction.black import Black
 from processing.reduction.noise import QUANTIZATION, NoiseModel
 from processing.storage.captures.capture import Capture
 
 #: Frames (channels, rows, columns) of a stored one.
-Planes: TypeAlias = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+Planes: TypeAlias = Callable[[NDArray[Any]], NDArray[Any]]
 
 #: [counts] Standard deviation of a frame from which on the mean of rounded counts is that of the intensities.
 SPREADING = 1.0
@@ -27,8 +28,6 @@ SPREADING = 1.0
 NEAR = 4
 #: [counts] Least spread that is tried.
 LEAST = 0.03
-#: [pixels] Of a channel that are looked at.
-PIXELS = 200_000
 #: [1] Levels within a count, and spreads, that are tried.
 LEVELS, SPREADS = 200, 40
 #: [1] Of the error of rounding, as far as the counts of an image are not normal.
@@ -119,4 +118,4 @@ class Rounding:
 def _subsample(planes: NDArray[np.float32]) -> NDArray[np.float32]:
     """Counts (channels, pixels) of frames (channels, rows, columns), of a large one every so many pixels."""
     counts = planes.reshape(len(planes), -1)
-    return counts[:, :: counts.shape[1] // PIXELS + 1]
+    return counts[:, :: counts.shape[1] // ENOUGH_PX + 1]

@@ -25,8 +25,6 @@ from processing.instrument.applied_effects import changes_of
 from processing.instrument.model import InstrumentModel
 from processing.reduction.move_image import taps
 
-#: [pixels of the sensor] By which frames are moved, and back again, to see what is lost: half of one loses most.
-TRIED_PX = 0.5
 #: [standard deviations of one intensity] By which a pixel is another one after the image was moved by half a pixel and
 #: back, from which on it is at an edge: what an image that moves does there cannot be undone.
 LOST_BY_MOVING = 0.5
@@ -54,7 +52,7 @@ def without_steep_pixels(data: CaptureData) -> CaptureData:
 
 def _lost_by_moving(data: CaptureData) -> Array:
     """Squared change of each pixel (rows, columns), over its variance and beyond what noise gives; mean of frames."""
-    change = _round_trip(TRIED_PX / data.binned)
+    change = _round_trip(0.5 / data.binned)
     change[FELT_PX] -= 1
     frames = data.signal.reshape(-1, *data.signal.shape[2:])
     slope, floor = (np.repeat(x, data.signal.shape[1]) for x in (data.slope, data.floor))
@@ -80,7 +78,7 @@ def screen_capture(data: CaptureData, model: InstrumentModel, say: Callable[[str
 
     `model` is resolved at its wavelength.
     """
-    a = rows_of(data, model)
+    a = data.rows_of(model, changes_of(model, data.conditions, data.name))
     outliers = outliers_of(data, a)
     hits, bad = np.argwhere(outliers.hits), np.argwhere(outliers.bad)
     if len(hits) or len(bad):
@@ -116,10 +114,3 @@ def _average_for_fit(data: CaptureData, say: Callable[[str], None]) -> CaptureDa
     # Again: rims are as wide as the derivatives of the image reach.
     dark = without_dark_pixels(fitted)
     return without_steep_pixels(replace(dark, dark_fraction=max(dark.dark_fraction, data.dark_fraction)))
-
-
-def rows_of(data: CaptureData, model: InstrumentModel) -> Array:
-    """Rows (L, 16) of the measurement matrix, or (L, 1) of the known sample, with the effects that the file has."""
-    changes = changes_of(model, data.conditions, data.name)
-    w = model.rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
-    return w if data.sample is None else (w @ data.sample)[:, None]

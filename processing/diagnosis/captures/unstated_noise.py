@@ -7,16 +7,10 @@ from scipy.optimize import nnls
 
 from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData
-from processing.diagnosis.search.rules import SMALL
+from processing.diagnosis.search.rules import ENOUGH_PX, LEAST_PART, SMALL
 
 #: [intensities of a pixel] Up to which every row tells noise that has any: there are no others.
 FEW_ROWS = 4
-#: [components, fixed] Of the states that count as signal: a Mueller matrix has 16 unknowns.
-COMPONENTS = 16
-#: [pixels] That are looked at.
-PIXELS = 20_000
-#: [of the mean variance] Least variance without light.
-LEAST_FLOOR = 0.01
 #: [digits] Of the range of the signal, to which two signals are the same.
 DIGITS = 9
 #: [levels] Of the signal at which their scatter is told.
@@ -31,10 +25,9 @@ def estimated_noise(data: CaptureData) -> CaptureData:
     over the image that is left as well makes the estimate too large, never too small.
     """
     picked = np.flatnonzero((data.usable & ~data.clipped).reshape(-1))
-    if picked.size > PIXELS:
-        picked = picked[:: picked.size // PIXELS + 1]
+    picked = picked[:: picked.size // ENOUGH_PX + 1]
     y = data.signal.reshape(data.values_per_pixel, -1)[:, picked].astype(np.float64)
-    most = COMPONENTS if data.sample is None else 2
+    most = 16 if data.sample is None else 2
     even = np.ones((len(y), 1))
     slope, floor = _line_of_scatter(y, even, even[:1], min(most, len(y) - 1, max(picked.size // 4, 1)))
     # In units of that noise, as it is by rows and by pixels, components that are no larger than noise show; they would
@@ -82,7 +75,7 @@ def _line_of_scatter(y: Array, of_row: Array, of_pixel: Array, keep: int) -> tup
         np.stack([np.maximum(mean, 0), np.ones(LEVELS)], axis=1) * weight[:, None], variance * weight
     )
     # Counts of zero have a noise all the same: where the line leads to none, they would weigh as much as they like.
-    floor = max(floor, LEAST_FLOOR * float(np.mean(square)), 1e-12)
+    floor = max(floor, LEAST_PART * float(np.mean(square)), 1e-12)
     # Weighted as it will be used, the scatter must come out as one.
     correction = float(np.mean(square / (slope * np.maximum(signal, 0) + floor)))
     return slope * correction, floor * correction

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,54 +26,16 @@ from processing.diagnosis.search.decision import Judgement, beyond_chance
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.names import Names
 from processing.diagnosis.search.posterior import Posterior, Say
-from processing.diagnosis.search.result import Diagnosis, FoundEffect
+from processing.diagnosis.search.result import Diagnosis
 from processing.diagnosis.search.rules import FAR_OFF, LIKELY, OUTSTANDING, SHARES
 from processing.diagnosis.verdict.answer import Answer, checks, effects_of_switches, unobservable
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture, CaptureError
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """A posterior, its correction, and what is left of each capture before and after it.
-
-    Attributes
-    ----------
-    structure : whether any test sees structure in what the mean of the posterior leaves; excess : chi-square of it.
-    """
-
-    bench: WholeBench
-    validation: InstrumentProblem
-    posterior: Posterior
-    solved: Solution
-    before: tuple[Residual, ...]
-    after: tuple[Residual, ...]
-    structure: bool
-    excess: float
-
-
-def outcome_of(bench: WholeBench, posterior: Posterior) -> Outcome:
-    """Test what a posterior leaves."""
-    problem = validation_problem(bench.problem)
-    unfit = bench.as_many_as_intensities(posterior, SHARES)
-    solved = solution(problem, posterior, bench.base, bench.base.vector(bench.start), unfit=unfit)
-    captures = range(len(problem.captures))
-    before = tuple(compute_residual(problem, k, solved.base, solved.before_fit) for k in captures)
-    after = tuple(compute_residual(problem, k, solved.space, solved.fit) for k in captures)
-    excess = sum(structure_chi2(problem, r) for r in after)
-    return Outcome(bench, problem, posterior, solved, before, after, has_structure(problem, after), excess)
-
-
-def has_structure(problem: InstrumentProblem, after: Collection[Residual]) -> bool:
+def has_structure(problem: InstrumentProblem, r: Residual) -> bool:
     """Whether a residual has structure; where its noise is unknown, of states beside each other."""
-    if problem.noise_known:
-        return any(beyond_chance(r.tests) for r in after)
-    return any(not white(r) for r in after)
-
-
-def structure_chi2(problem: InstrumentProblem, r: Residual) -> float:
-    """Chi-square of the structure of one capture; none where no test sees any: of many some err by two deviations."""
-    return r.excess if has_structure(problem, [r]) else 0.0
+    return bool(beyond_chance(r.tests)) if problem.noise_known else not white(r)
 
 
 def white(r: Residual) -> bool:
@@ -86,14 +48,13 @@ def white(r: Residual) -> bool:
     return bool(abs(lag) * np.sqrt(mean.size) < OUTSTANDING)
 
 
-def names_of(outcome: Outcome) -> Names:
-    """Names of the causes of a posterior, as far as what is left over allows them."""
-    problem, posterior, solved = outcome.validation, outcome.posterior, outcome.solved
-    likely = tuple(c for c in causes(posterior, outcome.excess) if c.probability >= LIKELY)
+def names_of(problem: InstrumentProblem, posterior: Posterior, solved: Solution, excess: float) -> Names:
+    """Names of the causes of a posterior, as far as the chi-square of structure that is left over allows them."""
+    likely = tuple(c for c in causes(posterior, excess) if c.probability >= LIKELY)
     untold = tuple(c for c in likely if c.candidates[0].effect.per_state and not testable(problem, solved, c, likely))
     named = tuple(c for c in likely if c not in untold)
     # What as many values as the data have took away may be any structure.
-    excess = outcome.excess + sum(2 * c.log_odds * posterior.samples.best.unit for c in untold)
+    excess += sum(2 * c.log_odds * posterior.samples.best.unit for c in untold)
     return Names(named, doubts(problem, posterior, solved, named, chi2=excess), untold)
 
 
@@ -119,10 +80,53 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     `declared` is the instrument at all the wavelengths of its file.
     """
     wiring, bench = _rewire(problem, say, declared)
-    posterior = bench.run()
+    problem, posterior = bench.problem, bench.run()
     say("testing what is left over")
-    used = outcome_of(bench, posterior)
-    return _judge(used, names_of(used), effects_of_switches(used.validation, used.solved), wiring)
+    validation, unfit = validation_problem(problem), bench.as_many_as_intensities(posterior, SHARES)
+    solved = solution(validation, posterior, bench.base, bench.base.vector(bench.start), unfit=unfit)
+    captures = range(len(validation.captures))
+    before, after = (tuple(compute_residual(validation, k, *end) for k in captures) for end in solved.ends)
+    # Where no test sees any, there is none: of many captures some err by two deviations.
+    excess = sum(r.excess for r in after if has_structure(validation, r))
+    names, switched = names_of(validation, posterior, solved, excess), effects_of_switches(validation, solved)
+    errors = MuellerErrors.of(validation, posterior, solved)
+    now, later, of_each = errors.changes(solved)
+    each = dict(zip((c.name for c in problem.captures), of_each, strict=True)) if len(of_each) > 1 else {}
+    lasting = lasts(later, solved, find_changed(validation, solved, names.doubt))
+    judgement = Judgement(
+        named=bool(names.named or switched or posterior.any_cause),
+        sure=bool(names.sure or switched),
+        structure=any(has_structure(validation, r) for r in after) or bool(names.untold),
+        observable=bool(observable_effects(posterior)),
+        figures=checks(validation, solved),
+        # Where there is nothing to apply, nothing is said of what it would do.
+        chances=chances(now, later, lasting, each) if solved.effects else (),
+        first=None if wiring is None else wiring.message,
+    )
+    answer = Answer(validation, posterior, solved, names, judgement, switched)
+    final, unseen = answer.applied, unobservable(bench.whole, posterior)
+    # Values that are merely nominal are nowhere near what is true.
+    nominal = any(c.place for c in solved.base.candidates)
+    is_known = judgement.refused is None or not nominal or (judgement.first is None and solved.before.rms < FAR_OFF)
+    diagnosis = Diagnosis(
+        **answer.fields(
+            recommended=lambda: recommended(problem, final.space, final.fit, names.rivals, unseen=missing(unseen)),
+            descriptions=descriptions([c.name for c in validation.captures], after),
+            captures=[
+                capture_report(validation, k, final, r, after=left)
+                for k, (r, left) in enumerate(zip(before, after, strict=True))
+            ],
+            unseen=unseen,
+            calibrated=calibrated(problem, posterior, final),
+            lasts=lasting,
+            uncertain=errors.uncertain(problem, final) if is_known else None,
+        ),
+        wiring=judgement.first,
+        branch=bench.branch,
+        left_out=not_measured(problem),
+        noise=noise_report(problem),
+    )
+    return Judged(diagnosis, problem, final, before, after if final is solved else before, after)
 
 
 def _rewire(problem: InstrumentProblem, say: Say, declared: InstrumentModel | None) -> tuple[Wiring | None, WholeBench]:
@@ -140,48 +144,6 @@ def _rewire(problem: InstrumentProblem, say: Say, declared: InstrumentModel | No
         return None, bench
     say(wiring.message)
     return wiring, WholeBench(wiring.problem, say)
-
-
-def _judge(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: Wiring | None) -> Judged:
-    problem, validation, posterior, solved = used.bench.problem, used.validation, used.posterior, used.solved
-    errors = MuellerErrors.of(validation, posterior, solved)
-    now, later, of_each = errors.changes(solved)
-    each = dict(zip((c.name for c in problem.captures), of_each, strict=True)) if len(of_each) > 1 else {}
-    lasting = lasts(later, solved, find_changed(validation, solved, names.doubt))
-    judgement = Judgement(
-        named=bool(names.named or switched or posterior.any_cause),
-        sure=bool(names.sure or switched),
-        structure=used.structure or bool(names.untold),
-        observable=bool(observable_effects(posterior)),
-        figures=checks(validation, solved),
-        # Where there is nothing to apply, nothing is said of what it would do.
-        chances=chances(now, later, lasting, each) if solved.effects else (),
-        first=None if wiring is None else wiring.message,
-    )
-    answer = Answer(validation, posterior, solved, names, judgement, switched)
-    final, unseen = answer.applied, unobservable(used.bench.whole, posterior)
-    # Values that are merely nominal are nowhere near what is true.
-    nominal = any(c.place for c in solved.base.candidates)
-    is_known = judgement.refused is None or not nominal or (judgement.first is None and solved.before.rms < FAR_OFF)
-    diagnosis = Diagnosis(
-        **answer.fields(
-            recommended=lambda: recommended(problem, final.space, final.fit, names.rivals, unseen=missing(unseen)),
-            descriptions=descriptions([c.name for c in validation.captures], used.after),
-            captures=[
-                capture_report(validation, k, final, before, after=after)
-                for k, (before, after) in enumerate(zip(used.before, used.after, strict=True))
-            ],
-            unseen=unseen,
-            calibrated=calibrated(problem, posterior, final),
-            lasts=lasting,
-            uncertain=errors.uncertain(problem, final) if is_known else None,
-        ),
-        wiring=judgement.first,
-        branch=used.bench.branch,
-        left_out=not_measured(problem),
-        noise=noise_report(problem),
-    )
-    return Judged(diagnosis, problem, final, used.before, used.after if final is solved else used.before, used.after)
 
 
 @one_blas_thread()

@@ -10,18 +10,16 @@ from processing.diagnosis.instrument.edges import at_edges
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.unevenness import Evenness
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import Cause, significance
+from processing.diagnosis.search.causes import LEAST_DIFFERENCE, Cause, significance
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.names import AT_BOUND, at_bound, with_parts
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import EDGES, LIMIT, OUTSTANDING, SURE, TESTABLE, UNEVEN_SHARE
+from processing.diagnosis.search.rules import EDGES, LIMIT, OUTSTANDING, TESTABLE, UNEVEN_SHARE
 
 #: The image does not move where that would be seen best.
 STANDS = "the edges, which were left out of the fit, do not move as it says"
 #: Optics, mechanics and detector are the same for the whole image.
 NOT_ALIKE = "it differs from part to part of the image, which this effect does not"
-#: [log odds, fixed] Of 99 to 1.
-STANDS_OUT = float(np.log(SURE / (1 - SURE)))
 #: Reasons that say that something else is there, of which what the cause explains is left over.
 ELSE = (STANDS, NOT_ALIKE)
 #: The sample of a capture, or its light, changed: what that capture alone says of the instrument may be a part of that.
@@ -40,7 +38,7 @@ def doubts(
         if reason is not None:
             reasons[cause] = reason
     # What is something else took away a part of what is left over.
-    another = [c.log_odds for c, why in reasons.items() if why in ELSE and c.log_odds > STANDS_OUT]
+    another = [c.log_odds for c, why in reasons.items() if why in ELSE and c.log_odds > LEAST_DIFFERENCE]
     chi2 += 2 * posterior.samples.best.unit * sum(another)
     return with_parts(posterior, causes, reasons, chi2=chi2, noise_known=problem.noise_known)
 

@@ -22,23 +22,18 @@ FEATURES = (
     *("counts", "one", "square", "cube", "fourth", "log", "log_square", "log_cube", "right", "down"),
     *("dx", "dy", "dxx", "dxy", "dyy"),
 )
-#: [features, fixed] The last of them are derivatives of the image by position.
-DERIVATIVES = 5
 NOTHING_SHARED = SharedNoise()
-#: [1, fixed] Savitzky-Golay filters of seven points: value (third order), first and second derivative (fourth and fifth
-#: order).
-VALUE = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21
-FIRST = np.array([22.0, -67.0, -58.0, 0.0, 58.0, 67.0, -22.0]) / 252
-SECOND = np.array([-13.0, 67.0, -19.0, -70.0, -19.0, 67.0, -13.0]) / 132
-FILTERS = (VALUE, FIRST, SECOND)
-#: [pixels, fixed] At the rim that the filters do not reach.
-MARGIN = VALUE.size // 2
-#: [1, fixed] Order of each derivative down and across the image, as they stand in FEATURES.
+#: [pixels, fixed] On either side that the filters take in, and at the rim that they do not reach.
+MARGIN = 3
+#: Savitzky-Golay filters: value (third order), first and second derivative (fourth and fifth order).
+FILTERS = tuple(
+    np.linalg.pinv(np.vander(np.arange(-MARGIN, MARGIN + 1.0), k + 4, increasing=True))[k] * max(k, 1) for k in range(3)
+)
+#: [1, fixed] Order of each derivative down and across the image, as they stand in FEATURES, of which they are the last.
 ORDERS = ((0, 1), (1, 0), (0, 2), (1, 1), (2, 0))
-#: [1, fixed] The filter that leaves a pixel as it is.
-POINT = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-#: [1, fixed] Filters down and across the image of a pixel itself and of its derivatives.
-PATTERNS = ((POINT, POINT), *((FILTERS[down], FILTERS[across]) for down, across in ORDERS))
+DERIVATIVES = len(ORDERS)
+#: Filters down and across the image of a pixel itself and of its derivatives.
+PATTERNS = ((np.eye(2 * MARGIN + 1)[MARGIN],) * 2, *((FILTERS[down], FILTERS[across]) for down, across in ORDERS))
 #: [answers] That are kept of what frames have of their noise in common.
 KEPT = 1024
 

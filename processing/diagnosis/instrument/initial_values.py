@@ -19,7 +19,8 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.posterior import Say
-from processing.diagnosis.search.rules import FAR_OFF
+from processing.diagnosis.search.range_of import NEARLY_ZERO
+from processing.diagnosis.search.rules import ALIKE, FAR_OFF
 from processing.diagnosis.search.space import Space
 from processing.instrument.elements import number
 
@@ -32,16 +33,6 @@ FAR_DEG = 120.0
 #: [places] From which nominal values are fitted.
 STARTS = 24
 
-#: [of the residual] By which two branches may differ that are the same to the data.
-ALIKE = 1e-3
-#: [degree, fixed] Period of the azimuth of an element.
-HALF_TURN = 180.0
-#: [degree] Distances closer than this are the same.
-TIE = 1e-6
-#: [degree, fixed] Period of a retardance.
-WHOLE = 360.0
-#: [degree, fixed] After which a retarder has the opposite retardance, and a diattenuator the opposite diattenuation.
-QUARTER_TURN = 90.0
 
 Values = dict[Candidate, Array]
 
@@ -63,7 +54,8 @@ class Branch:
 def nearest_branch(problem: InstrumentProblem, estimates: Mapping[Candidate, Array]) -> Branch:
     """The values found, on the branch whose azimuths are nearest to the instrument file."""
     values = _of_nominal_retardance(problem, estimates)
-    values = {c: _within_half_a_turn(c, v) if _is_azimuth(c) else v for c, v in values.items()}
+    # An azimuth turned by half a turn is the same.
+    values |= {c: _turn(c, v, -180.0 * round(_mean(c, v) / 180.0)) for c, v in values.items() if _is_azimuth(c)}
     places = sorted({c.place for c in values if _is_azimuth(c)})
     excess = _excess(problem, values)
     branches: list[tuple[tuple[str, ...], Values]] = [((), values)]
@@ -100,16 +92,16 @@ def _of_nominal_retardance(problem: InstrumentProblem, estimates: Mapping[Candid
         azimuth = azimuths.get(element)
         nearer = abs(same) - abs(opposite)
         # A half-wave plate has both at one distance: then the smaller retardance is taken, and the azimuth decides.
-        turns = nearer > TIE or (nearer > -TIE and opposite < same)
+        turns = nearer > NEARLY_ZERO or (nearer > -NEARLY_ZERO and opposite < same)
         if turns and azimuth is not None and azimuth.wavelength_nm == candidate.wavelength_nm:
-            values[azimuth] = _turn(azimuth, values[azimuth], QUARTER_TURN)
+            values[azimuth] = _turn(azimuth, values[azimuth], 90.0)
             same = opposite
         values[candidate] = np.array([same])
     return values
 
 
 def _near_zero(retardance_deg: float) -> float:
-    return float((retardance_deg + WHOLE / 2) % WHOLE - WHOLE / 2)
+    return float((retardance_deg + 180.0) % 360.0 - 180.0)
 
 
 def _is_azimuth(candidate: Candidate) -> bool:
@@ -121,10 +113,6 @@ def _mean(candidate: Candidate, values: Array) -> float:
     if candidate.curve is None:
         return float(values[0])
     return float(np.mean(candidate.curve.basis @ values))
-
-
-def _within_half_a_turn(candidate: Candidate, values: Array) -> Array:
-    return _turn(candidate, values, -HALF_TURN * float(np.round(_mean(candidate, values) / HALF_TURN)))
 
 
 def _turn(candidate: Candidate, values: Array, by_deg: float) -> Array:
@@ -139,7 +127,7 @@ def _turn_quarter(problem: InstrumentProblem, values: Values, places: tuple[str,
     reversed_too = {f"{place.rpartition('.')[0]}.diattenuation" for place in places}
     for candidate, value in values.items():
         if candidate.place in places:
-            by = -QUARTER_TURN if _mean(candidate, value) > 0 else QUARTER_TURN
+            by = -90.0 if _mean(candidate, value) > 0 else 90.0
             turned[candidate] = _turn(candidate, value, by)
         elif candidate.place in reversed_too and candidate.curve is None:
             turned[candidate] = -value - 2 * number(problem.model.value_of(candidate.place) or 0.0)
@@ -156,10 +144,6 @@ def _excess(problem: InstrumentProblem, values: Values) -> float:
     space = Space(tuple(values))
     sums = problem.sums(space, space.vector(values), derivatives=False)
     return float(sums.excess.sum() + sums.freedom.sum())
-
-
-#: [degree, fixed] Half width of the starts of azimuths, which come round again after half a turn.
-ANY_AZIMUTH = 90.0
 
 
 def first_values(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate], say: Say) -> Values:
@@ -229,7 +213,8 @@ def _widths(space: Space, retardance: float) -> Array:
     def width(candidate: Candidate) -> float:
         if not _anywhere(candidate):
             return 0.0
-        return ANY_AZIMUTH if candidate.place.endswith("azimuth_deg") else retardance
+        # Azimuths come round again after half a turn.
+        return 90.0 if candidate.place.endswith("azimuth_deg") else retardance
 
     return np.concatenate([np.zeros(0), *(np.full(c.size, width(c)) for c in space.candidates)])
 

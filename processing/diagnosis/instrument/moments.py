@@ -18,17 +18,14 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array, BoolArray
 from processing.diagnosis.captures.capture_data import CaptureData
+from processing.diagnosis.captures.read_capture import FEW_PIXELS
 from processing.diagnosis.instrument.features import FEATURES
 from processing.diagnosis.instrument.pixel_sums import Pixels, Precision, features_of_pixels, products_of_pixels
-from processing.diagnosis.search.rules import TILES
+from processing.diagnosis.search.rules import FOLDS_OF_TILES, TILES
 from processing.instrument.changes import places
 
 #: [intensities of a pixel] Beyond which states are held out, not tiles of the image.
 MOST_ROWS_FOR_TILES = 100
-#: [pixels] Below which states are held out.
-FEWEST_PIXELS_FOR_TILES = 64
-#: [parts] That are held out in turn, of the tiles of an image.
-FOLDS_OF_TILES = 2
 #: [parts] The same of the states, of which there are few.
 FOLDS_OF_STATES = 5
 #: [tiles] Along each side of an image, for effects and structure that vary over it.
@@ -122,7 +119,7 @@ class Moments:
 
 def holds_out_states(data: CaptureData) -> bool:
     """Whether states are held out (few pixels, or many states) instead of tiles of the image."""
-    return data.values_per_pixel > MOST_ROWS_FOR_TILES or int(data.usable.sum()) < FEWEST_PIXELS_FOR_TILES
+    return data.values_per_pixel > MOST_ROWS_FOR_TILES or int(data.usable.sum()) < FEW_PIXELS
 
 
 def folds_of(captures: Sequence[CaptureData]) -> int:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.decision import PredictedChange, chance_checks, predicted_change
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
@@ -33,16 +32,13 @@ MOST_STORED = 20
 #: [of the largest effect in a direction] Below which another one in it is left out.
 SMALL_PART = 0.03
 
-#: [elements, fixed] Of M/m00 that can be wrong.
-ELEMENTS = 15
-
 
 def mueller_slopes(
     problem: InstrumentProblem, space: Space, values: Array, rms: Array | None = None
 ) -> Iterator[tuple[NDArray[np.int64], Array]]:
     """For each capture: the J values that act on it, and products (16, J, J) of the slopes of each element of M/m00.
 
-    A common factor of M is left out. Products are means over the elements, and over the pixels by their brightness.
+    A common factor of M is left out. Products are means over the 15 elements, and over the pixels by their brightness.
     `rms` (captures,) is what the intensities of each are known to, in units of noise (default: 1). What they do not
     tell of M, within the size of its elements, is not made wrong by an instrument either.
     """
@@ -77,7 +73,7 @@ def mueller_slopes(
             for element, of_all in enumerate(np.moveaxis(slopes, 1, 0)):
                 products[element] += acting.spread_products(of_all @ of_all.T)
             light += bright
-        yield acting.index, products / (max(light, 1e-300) * ELEMENTS)
+        yield acting.index, products / (max(light, 1e-300) * 15)
 
 
 def _decompose(w: Array) -> tuple[Array, Array, Array]:
@@ -139,8 +135,8 @@ class MuellerErrors:
 
     def changes(self, used: Solution) -> tuple[PredictedChange, PredictedChange, tuple[PredictedChange, ...]]:
         """Change of M by a correction: for these captures, for later ones, and for each of these."""
-        correction, lasts = self.corrected_values(used), np.flatnonzero(self._of("instrument"))
-        products = self.products.sum(axis=0)
+        correction, products = self.corrected_values(used), self.products.sum(axis=0)
+        lasts = np.flatnonzero([c.scope == "instrument" for c in self.space.candidates for _ in c.parameters])
         return (
             self._change(np.arange(correction.size), correction, products),
             self._change(lasts, correction, products[np.ix_(lasts, lasts)]),
@@ -150,9 +146,6 @@ class MuellerErrors:
     def _change(self, index: NDArray[np.int64], correction: Array, products: Array) -> PredictedChange:
         return predicted_change(correction[index], self.values[index], self.covariance[np.ix_(index, index)], products)
 
-    def _of(self, scope: str) -> NDArray[np.bool_]:
-        return np.array([c.scope == scope for c in self.space.candidates for _ in c.parameters], dtype=bool)
-
     def uncertain(self, problem: InstrumentProblem, used: Solution) -> tuple[SystematicError, MuellerError] | None:
         """Remaining uncertainty of M/m00 about the applied values, as a file stores it and as the answer reports it.
 
@@ -160,7 +153,7 @@ class MuellerErrors:
         """
         missed = self.values - self.corrected_values(used)
         covariance = self.covariance + np.outer(missed, missed)
-        of_elements = np.sum(covariance * self.products, axis=(1, 2)) * ELEMENTS
+        of_elements = np.sum(covariance * self.products, axis=(1, 2)) * 15
         # That of M/m00 is one, whatever m00 is.
         of_elements[0] = 0.0
         if of_elements.sum() <= 0:
@@ -172,7 +165,7 @@ class MuellerErrors:
         names = tuple(c.name for c in problem.captures)
         several = len(set(problem.wavelengths_nm)) > 1
         slopes = np.sqrt(np.maximum(np.diag(products), 0.0))
-        rms = float(np.sqrt(of_elements.sum() / ELEMENTS))
+        rms = float(np.sqrt(of_elements.sum() / 15))
         stored = SystematicError(
             directions=tuple(
                 _effects_of(self.space, d, slopes * np.abs(d), names) for d in directions.T[: min(enough, MOST_STORED)]
@@ -226,23 +219,19 @@ def _effects_of(space: Space, direction: Array, size: Array, names: tuple[str, .
     for candidate, part in space.pairs:
         if size[part].max() <= SMALL_PART * size.max():
             continue
-        step = direction[part]
+        step, captures = direction[part], names if candidate.capture is None else (names[candidate.capture],)
         for single, values, _ in candidate.by_wavelength(step, np.zeros((step.size, step.size))):
             effects.append(
                 AppliedEffect(
                     kind=single.kind,
                     element=single.place or None,
                     parameters=_values_alone(single.stored(values, values)),
-                    captures=() if single.scope == "instrument" else _captures(single, names),
+                    captures=() if single.scope == "instrument" else captures,
                     scope=single.scope,
                     wavelength_nm=single.wavelength_nm,
                 )
             )
     return tuple(effects)
-
-
-def _captures(candidate: Candidate, names: tuple[str, ...]) -> tuple[str, ...]:
-    return names if candidate.capture is None else (names[candidate.capture],)
 
 
 def _values_alone(parameters: dict[str, EffectParameter]) -> dict[str, EffectParameter]:
@@ -268,6 +257,9 @@ def chances(
     and may lose. What is too vague for later captures is written for these alone (`lasts`).
     """
     predicted, grows = chance_checks("M/m00", now)
+    words = {
+        name: f"{c.rounded_chance:.2g}" if c.rounded_chance > 0 else "less than 0.0001" for name, c in each.items()
+    }
     alone = "" if lasting else ", so it is written for these captures alone"
     return (
         predicted,
@@ -275,7 +267,7 @@ def chances(
         Check(name=f"{grows.name} in later captures{alone}", before=0.0, after=later.rounded_chance, holds=True),
         *(
             Check(
-                name=f"predicted error of M/m00 of {name}, rms (it grows with a chance of {_in_words(change)})",
+                name=f"predicted error of M/m00 of {name}, rms (it grows with a chance of {words[name]})",
                 before=change.before,
                 after=change.after,
                 holds=True,
@@ -283,10 +275,6 @@ def chances(
             for name, change in each.items()
         ),
     )
-
-
-def _in_words(change: PredictedChange) -> str:
-    return f"{change.rounded_chance:.2g}" if change.rounded_chance > 0 else "less than 0.0001"
 
 
 def lasts(later: PredictedChange, solved: Solution, changed: Collection[int] = ()) -> bool:

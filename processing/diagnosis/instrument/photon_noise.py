@@ -12,10 +12,10 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData, Correct
-from processing.diagnosis.captures.noise import LEAST_PART, DetectorNoise, detector_noise, noise_factors
+from processing.diagnosis.captures.noise import DetectorNoise, detector_noise, noise_factors
 from processing.diagnosis.instrument.features import MARGIN
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.rules import DARK_NOISE_OFF, GAIN_OFF, NOISE_OFF, SHOWN
+from processing.diagnosis.search.rules import DARK_NOISE_OFF, GAIN_OFF, LEAST_PART, NOISE_OFF, SHOWN
 from processing.diagnosis.search.space import Space
 
 

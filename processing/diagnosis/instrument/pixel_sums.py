@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array, BoolArray
 from processing.computing.threads import for_ranges
-from processing.diagnosis.captures.capture_data import CaptureData
+from processing.diagnosis.captures.capture_data import STRIP_ROWS, CaptureData
 from processing.diagnosis.instrument.features import (
     FEATURES,
     derivatives_of_part,
@@ -24,21 +24,14 @@ from processing.diagnosis.instrument.features import (
     inside,
     shared_noise,
 )
+from processing.diagnosis.search.rules import ENOUGH_PX, LEAST_NOISE
 from processing.instrument.changes import places
 
 Precision = type[np.float32] | type[np.float64]
 #: [pixels] Of a strip.
 STRIP_PX = 16384
-#: [rows] That a strip has at least: derivatives need three more on either side.
-STRIP_ROWS = 16
 #: [pixels] That are multiplied together: their features stay in the cache.
 TOGETHER = 2048
-#: [pixels] From which on single precision is worth it.
-MANY_PX = 50_000
-#: [of the mean signal] Least noise for which single precision is enough.
-NOISE_OF_SINGLE = 1e-4
-#: [pixels] That tell the directions over the rows in which most of the light is.
-PIXELS_OF_BASIS = 5000
 
 
 @dataclass(frozen=True)
@@ -98,7 +91,7 @@ class Pixels:
 
     def precision(self, noise_floor: float) -> Precision:
         """Single precision where there are many pixels, and their noise over the mean signal is far above it."""
-        return np.float32 if self.good.sum() > MANY_PX and noise_floor > NOISE_OF_SINGLE else np.float64
+        return np.float32 if self.good.sum() > ENOUGH_PX and noise_floor > LEAST_NOISE else np.float64
 
     @cached_property
     def basis(self) -> Array:
@@ -108,7 +101,7 @@ class Pixels:
         made of; of features that are turned into these directions each keeps its own digits.
         """
         picked = np.flatnonzero(self.good)
-        picked = picked[:: picked.size // PIXELS_OF_BASIS + 1]
+        picked = picked[:: picked.size // ENOUGH_PX + 1]
         y = self.u.reshape(len(self.u), -1)[:, picked] / np.sqrt(self.scale.reshape(-1)[picked])
         return np.asarray(np.linalg.eigh(y @ y.T)[1])
 

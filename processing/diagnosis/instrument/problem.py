@@ -9,10 +9,11 @@ of the counts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
+from itertools import accumulate
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from processing.diagnosis.search.candidate import Candidate, SourceLevel, nomina
 from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.rules import EXACT
 from processing.diagnosis.search.space import Space, Sums
-from processing.instrument.applied_effects import apply_to, changes_of
+from processing.instrument.applied_effects import changes_of
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
 
@@ -238,14 +239,12 @@ class InstrumentProblem:
         if key not in cache:
             if len(cache) > MOST_ASKED:
                 cache.clear()
-            changes = cache[key] = Changes(data.conditions)
+            changes = Changes(data.conditions) if candidate else changes_of(model, data.conditions, data.name)
             if candidate:
                 candidate.apply(changes, model, values)
             else:
-                for applied in model.effects:
-                    if applied.scope == "instrument" or data.name in applied.captures:
-                        apply_to(changes, model, applied)
                 changes.shift_px = changes.shift_px - self.own_px[capture] * data.pitch
+            cache[key] = changes
         return cache[key]
 
     @property
@@ -280,10 +279,8 @@ class InstrumentProblem:
 
     def _columns_of_one_source(self, capture: int, changes: Changes) -> Array:
         """A (L, K) where the source has the same level in all states."""
-        data = self.captures[capture]
-        w = self.rows_of(capture, changes) * data.row_exposure[:, None]
-        a = w if data.sample is None else (w @ data.sample)[:, None]
-        return np.asarray(a / self.moments[capture].sigma[:, None])
+        rows = self.captures[capture].rows_of(self.models[capture], changes)
+        return np.asarray(rows / self.moments[capture].sigma[:, None])
 
     def channels(self, capture: int) -> int:
         """Channels of the detector."""
@@ -402,10 +399,33 @@ class InstrumentProblem:
 
     def slopes(self, k: int, space: Space, values: Array, a: Array, *, columns: Columns) -> Array:
         """Derivatives (values, ..., L, K) of the rows a (..., L, K) of a capture, which `columns` makes of changes."""
-        conditions = self.captures[k].conditions
-        return slopes_of_rows(
-            partial(self.changes, k, space), self.models[k], conditions, space, values=values, a=a, columns=columns
-        )
+        conditions, changes = self.captures[k].conditions, self._changes_about(k, space, values)
+        return slopes_of_rows(changes, self.models[k], conditions, space, values=values, a=a, columns=columns)
+
+    def _changes_about(self, k: int, space: Space, values: Array) -> Callable[[Array], Changes]:
+        """Changes of values of which those of one candidate differ: all before it and behind it are joined once."""
+        none = Changes(self.captures[k].conditions)
+
+        def joined(*parts: Changes) -> Changes:
+            total = Changes(none.conditions, built=self._built[k])
+            for part in parts:
+                if part is not none:
+                    total.add(part)
+            return total
+
+        pairs = space.pairs
+        each = [self._changes_of(k, c, values[p]) if values[p].any() else none for c, p in pairs]
+        before = list(accumulate([self._changes_of(k, None, np.zeros(0)), *each], joined))
+        behind = list(accumulate([none, *reversed(each)], lambda later, part: joined(part, later)))[::-1]
+
+        def changes(moved: Array) -> Changes:
+            differ = np.flatnonzero(moved != values)
+            if not differ.size:
+                return joined(before[-1])
+            i = space.owner(int(differ[0]))
+            return joined(before[i], self._changes_of(k, pairs[i][0], moved[pairs[i][1]]), behind[i + 1])
+
+        return changes
 
     def slopes_of_counts(self, k: int, space: Space, values: Array, c: Array) -> Array:
         """Derivatives (values, F, L) of the coefficients c (F, L) of the corrected counts of a capture."""

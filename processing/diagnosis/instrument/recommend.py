@@ -12,17 +12,12 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.range_of import least_apart
-from processing.diagnosis.search.rules import APART
+from processing.diagnosis.search.rules import APART, LEAST_NOISE, STEP
 from processing.diagnosis.search.space import Space
 from processing.polarization import mueller
 
 #: [sine] By which another sample has to do better than a simpler one to be asked for.
 CLEARLY_MORE = 0.15
-#: [of the signal] Signature of a typical size below which a capture does not see an effect.
-VISIBLE = 1e-4
-
-#: [typical sizes] Step of a difference of signals.
-STEP = 1e-3
 #: Samples that a lab has at hand, in the order of the trouble they make.
 SAMPLES: dict[str, NDArray[np.float64]] = {
     "air (Omega = 180 degrees, nothing at the centre)": np.eye(4),
@@ -97,7 +92,7 @@ def _power(
     unseen: Sequence[Candidate],
 ) -> float:
     signatures = [_signature(problem, space, fit, sample.reshape(16), candidate=c) for c in rivals or unseen]
-    is_visible = [bool(np.linalg.norm(each) >= VISIBLE) for each in signatures]
+    is_visible = [bool(np.linalg.norm(each) >= LEAST_NOISE) for each in signatures]
     if not rivals:
         return float(np.mean(is_visible)) if is_visible else 0.0
     return least_apart(signatures) if all(is_visible) or len(rivals) == 1 else 0.0

@@ -16,8 +16,6 @@ from processing.errors import ProcessError
 from processing.storage.integrity.h5_door import DAMAGE
 from processing.whole_file import whole_file
 
-#: [1, fixed] Largest number of a file in half precision, nearly.
-LARGEST_HALF = 6e4
 MOMENTS = ("before", "after")
 
 
@@ -47,7 +45,8 @@ def write_residuals(path: Path, judged: Judged, problem: InstrumentProblem) -> N
         harmonics = {}
         for moment, residual in zip(MOMENTS, (judged.before[k], judged.after[k]), strict=True):
             # Units of the noise: three digits are more than anybody sees.
-            arrays[f"image_{moment}_{k}"] = np.clip(residual.image, -LARGEST_HALF, LARGEST_HALF).astype(np.float16)
+            half = np.finfo(np.float16)
+            arrays[f"image_{moment}_{k}"] = np.clip(residual.image, half.min, half.max).astype(np.float16)
             arrays[f"per_state_{moment}_{k}"] = residual.per_state
             harmonics[moment] = {axis: values.tolist() for axis, values in residual.harmonics.items()}
         entries.append({"name": data.name, "harmonics": harmonics})

@@ -8,6 +8,7 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.rules import STEP
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects.base import turned_by
@@ -17,8 +18,6 @@ from processing.instrument.model import InstrumentModel
 Columns = Callable[[Changes], Array]
 #: Makes the changes of a capture of the values (K,) of a space.
 ChangesOf = Callable[[Array], Changes]
-#: [typical sizes] Step of a derivative.
-STEP = 1e-4
 
 
 def slopes_of_rows(

@@ -18,7 +18,7 @@ from processing.diagnosis.instrument.tiles import tile_columns
 from processing.diagnosis.search.decision import in_deviations, in_words
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.linearization import deviation_of
-from processing.diagnosis.search.range_of import range_of
+from processing.diagnosis.search.range_of import RANK, range_of
 from processing.diagnosis.search.rules import FEWEST_OF_MANY, FEWEST_PIXELS, TILES
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import FIELD_TERMS, Changes, field_terms
@@ -26,9 +26,6 @@ from processing.reduction.move_image import neighbour_noise
 
 #: [harmonics] Of a turn that are shown of a residual: an element that turns makes four.
 HARMONICS = 4
-
-#: [of the largest] Eigenvalues of the light below this are none.
-LEAST_LIGHT = 1e-10
 
 
 @dataclass(frozen=True)
@@ -204,7 +201,7 @@ def _tests(
     # Linear in the signal: every pixel's residual against the leading components of the fitted signal near by.
     s = images.around[:, good]
     _, size, vt = np.linalg.svd((s @ s.T).astype(float))
-    keep = min(columns, int(np.sum(size > LEAST_LIGHT * size[0])))
+    keep = min(columns, int(np.sum(size > RANK * size[0])))
     turned = vt[:keep] / np.sqrt(np.maximum(size[:keep], 1e-300))[:, None]
     weights = turned.astype(np.float32) @ s
     linear = flat @ weights.T

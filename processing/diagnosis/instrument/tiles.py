@@ -30,36 +30,30 @@ from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
 from processing.reduction.effects_of_capture import extra_retardance, with_extra
 
-#: [1, fixed] Frequency of what is linear in the rows.
-LINEAR = 1
-#: [1, fixed] Frequency of what is quadratic in the rows.
-QUADRATIC = 2
-
 
 def tile_columns(model: InstrumentModel, data: CaptureData, moments: Moments, changes: Changes) -> Array:
     """A (tiles, L, K) where a retardance varies over the image, rows in units of their noise."""
     if moments.tiles is None:
         raise ValueError("a capture that holds out states has no tiles")
-    shares = shares_of_tiles(moments.tiles, changes, LINEAR)
+    shares = shares_of_tiles(moments.tiles, changes, 1)
     return np.asarray(np.tensordot(shares, columns_at_nodes(model, data, moments, changes), axes=(0, 0)))
 
 
 def shares_of_tiles(tiles: Tiles, changes: Changes, frequencies: int) -> Array:
-    """Share (n, tiles) of each tile in the rows at each node, or in so many frequencies of them."""
+    """Share (n, tiles) of each tile in the rows at each node (one frequency), or in what is quadratic in them (two)."""
     return _shares(extra_retardance(changes, tiles.x, tiles.y), frequencies)
 
 
 def columns_at_nodes(model: InstrumentModel, data: CaptureData, moments: Moments, changes: Changes) -> Array:
     """A (n, L, K) with every retardance that varies at one of a few values, rows in units of their noise."""
-    nodes, angles = _nodes(len(changes.field_retardance_rad), LINEAR), data.conditions.angles_deg
-    w = np.stack([model.rows(angles, with_extra(changes, node)).reshape(-1, 16) for node in nodes])
-    a = w if data.sample is None else (w @ data.sample)[..., None]
-    return np.asarray(a * (data.row_exposure / moments.sigma)[:, None])
+    nodes = _nodes(len(changes.field_retardance_rad), 1)
+    a = np.stack([data.rows_of(model, with_extra(changes, node)) for node in nodes])
+    return np.asarray(a / moments.sigma[:, None])
 
 
 def at_more_nodes(linear: Array, elements: int) -> Array:
     """Linear function of the rows (..., n, L, K) at the nodes that the quadratic needs, for so many elements."""
-    shares = _shares(_nodes(elements, QUADRATIC).T, LINEAR)
+    shares = _shares(_nodes(elements, 2).T, 1)
     flat = linear.reshape(*linear.shape[:-2], -1)
     return np.asarray(shares.T @ flat).reshape(*linear.shape[:-3], shares.shape[1], *linear.shape[-2:])
 
@@ -205,7 +199,7 @@ def slopes_of_tiles(
     counted = np.flatnonzero(np.any(dc, axis=(1, 2)))
     return TileSlopes(
         at_more_nodes(at_nodes, len(changes.field_retardance_rad)),
-        shares_of_tiles(moments.tiles, changes, QUADRATIC),
+        shares_of_tiles(moments.tiles, changes, 2),
         np.array(list(fields), dtype=np.int64),
         np.array(list(fields.values())).reshape(-1, *a.shape),
         counted,
@@ -309,16 +303,11 @@ def add_tiles(
             add_parts(part, moments, rows[None], tiles.pixels[some], fold=fold, out=out)
             yield some, part
 
-    for selection in _together(use, apart):
+    bounds = [] if apart is None else (np.flatnonzero(np.diff(use // apart)) + 1).tolist()
+    for selection in (slice(i, j) for i, j in pairwise([0, *bounds, use.size])):
         of_rows = None if slopes is None else slopes.of_rows(use[selection], used)
         for fold in range(len(out.excess)):
             if of_rows is None:
                 deque(projected(fold, selection), maxlen=0)
             else:
                 add_slopes(projected(fold, selection), of_rows, fold, out)
-
-
-def _together(use: NDArray[np.int64], apart: int | None) -> list[slice]:
-    """Which of the rows in use have the same unknowns."""
-    bounds = [] if apart is None else (np.flatnonzero(np.diff(use // apart)) + 1).tolist()
-    return [slice(i, j) for i, j in pairwise([0, *bounds, use.size])]

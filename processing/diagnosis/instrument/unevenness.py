@@ -12,9 +12,9 @@ from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import Tiles
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import Projected
-from processing.diagnosis.instrument.slopes import STEP
 from processing.diagnosis.instrument.tiles import features_of_tiles
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.rules import STEP
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import field_terms
 

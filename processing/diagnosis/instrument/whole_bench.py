@@ -44,7 +44,9 @@ class WholeBench:
         self.whole = problem.undivided() if problem.holds_out_states else problem
         self.base = Space((*problem.nominal(), *problem.levels()))
         self.pool = problem.pool()
-        self._free = [c.values_per_pixel - self._unknowns(k) for k, c in enumerate(self.whole.captures)]
+        start = [self.whole.changes(k, Space(()), np.zeros(0)) for k in range(len(self.whole.captures))]
+        unknowns = [int(np.linalg.matrix_rank(self.whole.columns(k, changes))) for k, changes in enumerate(start)]
+        self._free = [c.values_per_pixel - n for c, n in zip(self.whole.captures, unknowns, strict=True)]
         if max(self._free) <= 0:
             most = max(c.values_per_pixel for c in self.whole.captures)
             raise CaptureError(
@@ -109,16 +111,13 @@ class WholeBench:
             with_fields = self._with_fields(posterior, fixed, plain, fields)
             posterior = posterior if with_fields is posterior else self._without_refuted(with_fields, fixed)
         # Behind a bent response the noise that counts should have is wrong by percents.
-        if self.whole.noise_known and self._adopt_noise(*applied(posterior, self.base)):
+        space, values = applied(posterior, self.base)
+        if self.whole.noise_known and self.whole.adopt_noise(space, values):
+            if self.whole is not self.problem:
+                self.problem.adopt_noise(space, values)
             self.say("the same with the noise that this light has")
             posterior = self._posterior(list(posterior.space.candidates), fixed, posterior)
         return posterior
-
-    def _adopt_noise(self, space: Space, values: Array) -> bool:
-        is_adopted = self.whole.adopt_noise(space, values)
-        if is_adopted and self.whole is not self.problem:
-            self.problem.adopt_noise(space, values)
-        return is_adopted
 
     def _without_refuted(self, posterior: Posterior, fixed: Sequence[Candidate]) -> Posterior:
         """Without corrections of the counts whose light would scatter otherwise than the counts do.
@@ -143,9 +142,6 @@ class WholeBench:
         far = {c: v for c, v in undone.items() if np.any(np.abs(v) > EXACT * c.typical)}
         gains = {c: scatter_prefers(self.whole, space, values, {c: v}) for c, v in far.items()}
         return {c: gain for c, gain in gains.items() if gain < -NEEDED}
-
-    def _unknowns(self, k: int) -> int:
-        return int(np.linalg.matrix_rank(self.whole.columns(k, self.whole.changes(k, Space(()), np.zeros(0)))))
 
     def _is_offered(self, candidate: Candidate) -> bool:
         effect = candidate.effect

@@ -160,12 +160,6 @@ class Candidate:
         return np.array([p.upper for p in self.parameters])
 
 
-#: [degree] How far an azimuth may be from its nominal value: no valley ends there.
-AZIMUTH_DEG = 400.0
-#: [degree] The same of a retardance.
-RETARDANCE_DEG = 200.0
-#: [degree] The same of a window.
-WINDOW_REACH_DEG = 40.0
 #: [1] The same below zero of an extinction or a depolarization: noise may take it there.
 BELOW_ZERO = 0.02
 #: [1] Size of the change of a level from state to state.
@@ -177,9 +171,9 @@ MOST_LOST = 0.95
 def _nominal(field: str, window: bool) -> Parameter:
     """A nominal value; what has no retardance is a window, and close to that."""
     if field == "azimuth_deg":
-        return Parameter("azimuth", "degree", -AZIMUTH_DEG, AZIMUTH_DEG, NOMINAL_DEG)
+        return Parameter("azimuth", "degree", -400.0, 400.0, NOMINAL_DEG)
     if field == "retardance_deg":
-        reach, size = (WINDOW_REACH_DEG, WINDOW_DEG) if window else (RETARDANCE_DEG, NOMINAL_DEG)
+        reach, size = (40.0, WINDOW_DEG) if window else (200.0, NOMINAL_DEG)
         return Parameter("retardance", "degree", -reach, reach, size)
     if field == "diattenuation":
         return Parameter(field, "1", -1.0, 1.0, NOMINAL_SHARE)

@@ -11,12 +11,12 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import ALIKE, LIKELY, NOMINAL_TAU, OUTSTANDING, SHOWN, SURE
-from processing.diagnosis.search.sets import probability_at
 from processing.diagnosis.search.space import Problem
 
 #: [log odds] By which one of two causes has to be likelier for a sure name.
@@ -78,7 +78,8 @@ def causes(posterior: Posterior, chi2: float) -> tuple[Cause, ...]:
         alternatives += [j for j in posterior.rivals.get(k, ()) if j not in alternatives]
         parts = [posterior.space.slices[m] for m in posterior.members[k]]
         # The effect can be certain while the state from which it acts is open.
-        members = list(dict.fromkeys([k, *alternatives, *_of_family(posterior, k)]))
+        of_family = (j for j in range(len(posterior.members)) if posterior.label(j).family == posterior.label(k).family)
+        members = list(dict.fromkeys([k, *alternatives, *of_family]))
         # The visited sets, and the odds given the likeliest set, are both too confident.
         total = float(np.logaddexp.reduce(odds[members]))
         result.append(
@@ -86,7 +87,7 @@ def causes(posterior: Posterior, chi2: float) -> tuple[Cause, ...]:
                 candidates=tuple(posterior.space.candidates[m] for m in posterior.members[k]),
                 values=tuple(values[p] for p in parts),
                 covariance=tuple(covariance[p, p] for p in parts),
-                probability=min(posterior.samples.any_of(members), float(probability_at(total))),
+                probability=min(posterior.samples.any_of(members), float(expit(total))),
                 log_odds=float(odds[k]),
                 alternatives=tuple(posterior.space.candidates[posterior.members[j][0]] for j in alternatives),
             )
@@ -108,11 +109,6 @@ def forgiven_misfit(fit_gain: Array, k: int, chi2: float) -> Array:
     """
     allowed = max(ALIKE * fit_gain[k], 0.5 * chi2)
     return np.asarray(np.clip(fit_gain[k] - fit_gain, 0.0, allowed))
-
-
-def _of_family(posterior: Posterior, k: int) -> list[int]:
-    """Groups of the same effect, from one state on or another."""
-    return [j for j in range(len(posterior.members)) if posterior.label(j).family == posterior.label(k).family]
 
 
 def information(posterior: Posterior) -> tuple[Array, NDArray[np.int64]]:

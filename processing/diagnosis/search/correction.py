@@ -7,10 +7,9 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
-from processing.diagnosis.search.descent import LEAST_WIDTH
 from processing.diagnosis.search.fit import Fit, Solution, held_out, minimize
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import LIKELY, SEEN, SHARES, TAKES_PART
+from processing.diagnosis.search.rules import LIKELY, LITTLE, SEEN, SHARES, TAKES_PART
 from processing.diagnosis.search.space import Problem, Space
 
 
@@ -68,5 +67,5 @@ def solution(
     fit = Fit(values, sums, float(sums.excess.sum()))
     typical = space.joined("typical")
     spread = space.vector(posterior.space.split(np.diag(posterior.covariance)))
-    weak = posterior.samples.best.unit / np.maximum(np.sqrt(spread + values**2), LEAST_WIDTH * typical) ** 2
+    weak = posterior.samples.best.unit / np.maximum(np.sqrt(spread + values**2), LITTLE * typical) ** 2
     return Solution(base, base_fit, before, space, fit, held_out(problem, space, fit, weak), weak)

@@ -8,22 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.search.averages import Samples, sample
+from processing.diagnosis.search.averages import Samples, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import minimize
-from processing.diagnosis.search.rules import NOMINAL_TAU, SAMPLES_BEFORE, TAKES_PART
+from processing.diagnosis.search.rules import CHANGES_BEFORE, EXACT, LITTLE, NOMINAL_TAU, TAKES_PART
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Problem, Space
-
-#: [standard deviations] A move of the solution below which no new linearization is needed.
-SETTLED = 0.3
 
 #: [steps] Of a descent.
 STEPS = 6
 #: [times] That everything is linearized anew before groups are chosen.
 EXPANSIONS = 8
-#: [typical sizes] Least width of a prior of values that are fitted.
-LEAST_WIDTH = 1e-3
 
 
 def all_at_once(
@@ -41,7 +36,7 @@ def all_at_once(
         weak = noise.unit(sums.chi2(problem.noise_known)) / width**2
         new = minimize(problem, part, values, steps=3, expansions=0, weak=weak).values
         moved, values = np.max(np.abs(new - values) / width), new
-        if not problem.relinearize(part, values) and moved < SETTLED:
+        if not problem.relinearize(part, values) and moved < EXACT:
             break
     start_values = x.copy()
     start_values[positions] = values
@@ -56,10 +51,10 @@ def alone(problem: Problem, space: Space, chosen: Sequence[int]) -> Array:
 
 def next_values(problem: Problem, space: Space, sets: Sets, state: State, *, x: Array) -> tuple[Array, bool]:
     """Values (K,) about which to linearize next, and whether they are so near to x (K,) that there is no need."""
-    samples = sample(sets, state, SAMPLES_BEFORE)
+    samples = stay(sets, [(state, 1.0)], CHANGES_BEFORE)
     new = descend(problem, space, sets.groups, samples, starts=[mean_over_sets(space, samples, x), x])
     spread = np.sqrt(np.maximum(np.diag(samples.covariance), 1e-12)) * space.joined("typical")
-    return new, bool(np.all(np.abs(new - x) < SETTLED * spread))
+    return new, bool(np.all(np.abs(new - x) < EXACT * spread))
 
 
 def mean_over_sets(space: Space, samples: Samples, x: Array) -> Array:
@@ -84,7 +79,7 @@ def descend(
     part, positions = _part_of(space, [g for g, p in zip(groups, samples.probability, strict=True) if p > TAKES_PART])
     typical = space.joined("typical")[positions]
     width = np.sqrt(np.diag(samples.covariance) + samples.mean**2)[positions] * typical
-    weak = samples.best.unit / np.maximum(width, LEAST_WIDTH * typical) ** 2
+    weak = samples.best.unit / np.maximum(width, LITTLE * typical) ** 2
     values = np.where(space.fixed, starts[0], 0.0)
     if positions.size:
         places = [x[positions] for x in starts]

@@ -13,11 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from processing.arrays import Array
+from processing.diagnosis.search.range_of import NEARLY_ZERO
 from processing.diagnosis.search.rules import SMOOTH
 from processing.effect import Parameter
-
-#: [of the variance of the largest] Principal curves of such values below which nothing is told of them.
-FLAT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -63,5 +61,5 @@ def curve(wavelengths_nm: Sequence[float], parameters: tuple[Parameter, ...]) ->
 def _principal_curves(wavelengths_nm: tuple[float, ...]) -> Array:
     u = np.log(np.asarray(wavelengths_nm)) / SMOOTH
     size, vector = np.linalg.eigh(np.exp(-0.5 * (u[:, None] - u) ** 2))
-    keep = size > FLAT * size[-1]
+    keep = size > NEARLY_ZERO * size[-1]
     return np.asarray((vector[:, keep] * np.sqrt(size[keep]))[:, ::-1])

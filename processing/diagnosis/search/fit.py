@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array, BoolArray
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.rules import LITTLE, NOMINAL_TAU
 from processing.diagnosis.search.space import Problem, Space, Sums
 
 #: [of the degrees of freedom] That fitted values leave at least, where nothing is held out.
 LEAST_FREEDOM = 0.2
-#: [typical sizes] Width of the prior that keeps unseen parameters still.
-PRIOR_WIDTH = 10.0
 #: [steps] Of a fit.
 STEPS = 15
 #: [times] That corrections of counts are expanded anew in one fit.
@@ -28,8 +27,6 @@ LEAST_RELATIVE = 1e-7
 HELD_OUT_RELATIVE = 1e-4
 #: [1] By which a step that is refused is damped more, and one that is taken less.
 STIFFER = 10.0
-#: [of the curvature] Damping of a step that was refused without any.
-FIRST_DAMPING = 1e-3
 #: [of the curvature] Damping beyond which there is no step.
 MOST_DAMPING = 1e6
 
@@ -50,7 +47,7 @@ class Fit:
 
 def prior(space: Space) -> Array:
     """Curvature (K,) of the weak prior about zero."""
-    return np.asarray(1.0 / (PRIOR_WIDTH * space.joined("typical")) ** 2)
+    return np.asarray(1.0 / (NOMINAL_TAU * space.joined("typical")) ** 2)
 
 
 def minimize(
@@ -117,12 +114,12 @@ def _descend(
             now = _penalize(problem.sums(space, tried, derivatives=False), weak, tried, use, reference=reference)
             if now <= cost or damping > MOST_DAMPING:
                 break
-            damping = max(damping * STIFFER, FIRST_DAMPING)
+            damping = max(damping * STIFFER, LITTLE)
         # Also where the sum is no number: so far away that the model has no intensities.
         if not now <= cost:
             break
         gain, x, cost, sums = cost - now, tried, now, problem.sums(space, tried)
-        damping = damping / STIFFER if damping > FIRST_DAMPING else 0.0
+        damping = damping / STIFFER if damping > LITTLE else 0.0
         if gain < least_gain + LEAST_RELATIVE * abs(cost):
             break
     return Fit(x, sums, float(sums.excess[use].sum()))
@@ -170,11 +167,6 @@ class HeldOut:
         """The same of one capture alone."""
         square, count, excess, freedom = self.shares[capture].tolist()
         return HeldOut(excess, max(freedom, 1e-300), square, max(count, 1e-300))
-
-    def and_more(self, excess: float, square: float) -> HeldOut:
-        """The same with a larger residual, in units of the noise and of the signal."""
-        # Fits to other folds may end elsewhere than the fit to all, whose difference this is.
-        return HeldOut(self.excess + excess, self.freedom, max(self.square + square, 0.0), self.count)
 
     @property
     def chi2_reduced(self) -> float:

@@ -8,7 +8,7 @@ from processing.arrays import BoolArray
 from processing.diagnosis.search.rules import ALTERNATIVE, NEEDED
 from processing.diagnosis.search.sets import NEVER, Sets, State
 
-#: [changes] That are tried one after the other without a gain before a climb ends.
+#: [changes] That are tried one after the other without a gain before a climb ends, and instead of one group.
 PATIENCE = 8
 
 #: [changes] Of a set in one climb.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Answer, Cause
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import BOUND, CERTAIN, LIKELY, SURE, TIMES
+from processing.diagnosis.search.rules import CERTAIN, LIKELY, LITTLE, SURE, TIMES
 
 AT_BOUND = "a value stands at its bound: the data ask for something else"
 #: Reasons that leave a name likely.
@@ -69,7 +69,7 @@ def at_bound(cause: Cause) -> bool:
     """Whether a value of a cause stands at the end of its range."""
     for candidate, values in zip(cause.candidates, cause.values, strict=True):
         width = candidate.upper - candidate.lower
-        if (((values - candidate.lower) < BOUND * width) | ((candidate.upper - values) < BOUND * width)).any():
+        if (((values - candidate.lower) < LITTLE * width) | ((candidate.upper - values) < LITTLE * width)).any():
             return True
     return False
 

@@ -9,16 +9,16 @@ import numpy as np
 
 from processing.arrays import Array
 
-#: [of the largest] Singular values below this are none.
+#: [of the largest] Singular values below this are none: half of the digits of a number.
 RANK = 1e-8
-#: [of the largest] The same of a signature, which is made of the finest differences.
-LEAST_OF_SIGNATURE = 1e-9
+#: [of the whole] A part below this is none, wherever noise is far larger.
+NEARLY_ZERO = 1e-6
 
 
-def range_of(a: Array, least: float = RANK) -> Array:
+def range_of(a: Array) -> Array:
     """Orthonormal directions (L, rank) that the columns of a (L, K) reach."""
     u, size, _ = np.linalg.svd(a, full_matrices=False)
-    return np.asarray(u[:, size > least * size[0]])
+    return np.asarray(u[:, size > RANK * size[0]])
 
 
 def inside_and_outside(a: Array) -> tuple[Array, Array]:
@@ -30,7 +30,7 @@ def inside_and_outside(a: Array) -> tuple[Array, Array]:
 
 def part_outside(a: Array, b: Array) -> float:
     """Part of a signature a (L, K) that another one, b (L, M), does not reach: the sine of their angle."""
-    u, norm = range_of(b, LEAST_OF_SIGNATURE), float(np.linalg.norm(a))
+    u, norm = range_of(b), float(np.linalg.norm(a))
     return float(np.linalg.norm(a - u @ (u.T @ a)) / norm) if norm else 0.0
 
 

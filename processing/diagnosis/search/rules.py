@@ -43,13 +43,16 @@ SLACK = 2.0
 #: [of its variance] Standard error of the noise itself: no gain is known better than to half a percent. Of two million
 #: intensities that is five times what chance does to their sum of squares.
 NOISE_LEVEL = 0.005
-#: [of the signal] Least residual that is taken as noise where the noise is not known: no bench repeats better.
+#: [of the signal] Least residual that is taken as noise where the noise is not known: no bench repeats better. An
+#: effect of less is not seen, and single precision is enough for more.
 LEAST_NOISE = 1e-4
 
 
 # ---- what is left out of a capture ---------------------------------------------------------------------------------
 #: [pixels, pairs] Below which nothing can stand out, neighbours are not compared, and an object tells nothing.
 FEWEST_OF_MANY = 100
+#: [pixels] That tell a scatter, or its directions, to half a percent: more need not be looked at.
+ENOUGH_PX = 50_000
 #: [of the residual] That a bad frame, a far start or a round of a search has to take away.
 MOSTLY = 0.5
 
@@ -63,8 +66,13 @@ NOISE_OFF = 0.06
 #: [1] The same of the part of the variance without light: darks of a lab are as good.
 DARK_NOISE_OFF = 0.5
 #: [of the whole] Below which a part tells nothing: of the variance with or without light, of the scatter of a row, of
-#: the light in dim pixels, of the noise in image derivatives.
+#: the light in dim pixels, of the noise in image derivatives, of the noise that neighbours share.
 SMALL = 0.05
+#: [of the whole] A part that changes nothing: weak beliefs, first damping, least width of a prior and of a noise, and
+#: how close to a bound a value stands there.
+LITTLE = 1e-3
+#: [of what is usual] Least part of the variance that weights are made of.
+LEAST_PART = 0.01
 #: [1] Deviation of the variance from what is declared where a bend of the response is undone, beyond which that bend
 #: does not go with how the counts scatter: two standard deviations of what labs know of a gain.
 GAIN_OFF = 0.03
@@ -80,8 +88,8 @@ NEEDED = 12.0
 #: [1] Growth of the unit of chi-square, by what the tests of the residual find, from which on the sets are visited
 #: again; and at values beyond what a straight line to them promised, from which on it is not believed.
 GROWTH = 1.05
-#: [typical sizes] Up to which a straight line is exact enough: from where counts were corrected exactly, and as the
-#: standard deviation of every group where all begin at once.
+#: [typical sizes, or standard deviations] Up to which a straight line is exact enough: from where counts were corrected
+#: exactly, or where the problem was linearized.
 EXACT = 0.3
 #: [log odds] At which a group is certain and is not tested any more. A name needs as much where the residual alone
 #: measures the noise, since part of the residual may be structure.
@@ -114,6 +122,8 @@ FEWEST_PIXELS = 30
 # ---- what is held out, and parts of an image ------------------------------------------------------------------------
 #: [tiles] Along a side of a small image, of an object, and of the patches whose means are tested.
 TILES = 8
+#: [parts] That are held out in turn, of the tiles, as a chessboard has them.
+FOLDS_OF_TILES = 2
 
 # ---- names ---------------------------------------------------------------------------------------------------------
 #: [probability] From which on a cause is called sure.
@@ -127,14 +137,10 @@ ALTERNATIVE = 7.0
 ALIKE = 1e-3
 #: [standard deviations] From which on a value is not zero; of several as many beyond what chance gives all of them.
 SHOWN = 3.0
-#: [causes] That are told with what each would explain alone.
+#: [causes] That are told with what each would explain alone; half of them as tried where nothing is named.
 MOST_RANKED = 10
-#: [causes] That are told as tried where nothing is named.
-MOST_TRIED = 5
 
 # ---- why a name is doubted -----------------------------------------------------------------------------------------
-#: [of the range] How close to the end of a parameter's range a value stands at its bound.
-BOUND = 1e-3
 #: [of a shift, and of what is left at the edges] What sharp edges, which no fit saw, must show of an image that is said
 #: to move. Where it does they show 0.5 to 1.1 of it, and it explains 0.5 to 0.7 of what they do; of light that is
 #: added, or a spot that fades, one of the two is 0 to 0.4.
@@ -158,13 +164,15 @@ OUTSTANDING = 4.0
 APART = 0.3
 
 # ---- effort: what a search may cost --------------------------------------------------------------------------------
+#: [typical sizes] Step of a derivative.
+STEP = 1e-4
 #: [rounds] Times that the problem is linearized anew about its solution.
 ROUNDS = 7
 #: [rounds] The same where the noise is not known: each makes what is left smaller, which is then taken for the noise.
 FEWER_ROUNDS = 4
 #: [changes] Of a chain in the last round.
 CHANGES = 1000
-#: [sets] That are visited in the last round where what is left is the noise.
-SAMPLES = 300
-#: [sets] That are visited in the rounds before.
-SAMPLES_BEFORE = 80
+#: [changes] The same where the noise is not known, of benches with many captures.
+FEWER_CHANGES = 300
+#: [changes] The same in the rounds before.
+CHANGES_BEFORE = 80

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +22,6 @@ from scipy.special import betaln
 from processing.arrays import Array
 from processing.diagnosis.search.rules import FEW_CAUSES, MANY, TAU, TAU_WEIGHT, TAU_WEIGHT_OF_MANY
 
-#: [log odds] Beyond which a probability is zero or one for any number of sixteen digits.
-MOST_ODDS = 50.0
-
-
-def probability_at(log_odds: Array | float) -> Array:
-    """Probability of each of some log odds."""
-    return np.asarray(1 / (1 + np.exp(-np.clip(log_odds, -MOST_ODDS, MOST_ODDS))))
-
-
-#: [probability] Of an impossible variance, for its logarithm.
-LEAST_WEIGHT = 1e-300
 #: [log odds] Of an impossible set, below the evidence of any data.
 NEVER = -1e9
 #: [groups] That are not there, at least, in the odds of one more.
@@ -90,28 +80,20 @@ class Noise:
     slack: float = 0.0
     floor: float = 1.0
 
-    def units(self, excess: Array) -> Array:
-        """Most likely unit where a fit has an `excess`, the cost of the prior included."""
+    def unit(self, excess: Any) -> Any:
+        """Most likely unit where a fit has an `excess`, one or several, the cost of the prior included."""
         beyond = self.directions + np.maximum(excess - self.slack, 0.0) if self.is_known else excess
         return np.maximum(beyond / self.directions, self.floor)
 
-    def unit(self, excess: float) -> float:
-        """The same of one excess."""
-        return float(self.units(np.array(excess)))
-
-    def log_likelihoods(self, excess: Array) -> Array:
+    def log_likelihood(self, excess: Any) -> Any:
         """Log of the likelihood with the most likely unit."""
-        spread, within = excess, np.zeros(())
+        spread, within = excess, 0.0
         if self.is_known:
             # Within the noise differences count in full.
             spread = self.directions + np.maximum(excess - self.slack, 0.0)
             within = np.minimum(excess - self.slack, 0.0)
-        unit = self.units(excess)
-        return np.asarray(-0.5 * (self.directions * np.log(unit) + spread / unit + within))
-
-    def log_likelihood(self, excess: float) -> float:
-        """The same of one excess."""
-        return float(self.log_likelihoods(np.array(excess)))
+        unit = self.unit(excess)
+        return -0.5 * (self.directions * np.log(unit) + spread / unit + within)
 
 
 @dataclass
@@ -155,14 +137,11 @@ class Conditional(SetFit):
 class Sets:
     """Sets of groups in one quadratic problem.
 
-    `count` is the number of groups that might be there, if these are not all of them; `beside` is how many others are
-    present.
+    `count` is the number of groups that might be there, if these are not all of them.
     """
 
-    def __init__(
-        self, form: Quadratic, groups: Sequence[Group], noise: Noise, count: float | None = None, *, beside: int = 0
-    ) -> None:
-        self.form, self.groups, self.noise, self.beside = form, tuple(groups), noise, beside
+    def __init__(self, form: Quadratic, groups: Sequence[Group], noise: Noise, count: float | None = None) -> None:
+        self.form, self.groups, self.noise = form, tuple(groups), noise
         self.free = np.array([g.fixed_tau is None for g in groups], dtype=bool)
         self.share = np.array([g.share for g in groups])
         self.price = np.array([g.price for g in groups])
@@ -189,7 +168,7 @@ class Sets:
     def settled(self, state: State) -> State:
         """The state with the unit of its residual."""
         for _ in range(4):
-            before, state.unit = state.unit, self.noise.unit(self._excess(state))
+            before, state.unit = state.unit, float(self.noise.unit(self._excess(state)))
             if state.unit == before:
                 break
         return state
@@ -200,26 +179,22 @@ class Sets:
         reduced.tau[k] = 0.0
         return reduced
 
-    def among(self, form: Quadratic, indices: NDArray[np.int64], groups: Sequence[Group], beside: int) -> Sets:
-        """The same prior for the groups `indices` alone, with new positions; `beside` of the others are in the set."""
-        return Sets(form, groups, self.noise, self.count, beside=self.beside + beside)
-
     def _log_prior(self, tau: Array) -> float:
         """Log probability of a set and its variances."""
         is_included = self.free & (tau > 0)
         weight = self.tau_weight[is_included, np.argmin(np.abs(self.taus[:, None] - tau[is_included]), axis=0)]
-        return self.log_prior(is_included) + float(np.log(np.maximum(weight, LEAST_WEIGHT)).sum())
+        return self.log_prior(is_included) + float(np.log(np.maximum(weight, 1e-300)).sum())
 
     def log_prior(self, is_included: NDArray[np.bool_]) -> float:
         """Log probability of a set: how likely a group is is learnt from how many there are (beta-binomial)."""
-        k, n = float(is_included.sum()) + self.beside, self.count
+        k, n = float(is_included.sum()), self.count
         count = betaln(1 + k, max(n - k, 0.0) + FEW_CAUSES * n) - betaln(1, (1 + FEW_CAUSES) * n)
         too_many = max(float((is_included & self.alone).sum()) - 1, 0.0)
         return float(count - np.log(self.share[is_included]).sum() - self.price[is_included].sum()) + NEVER * too_many
 
     def prior_odds(self, is_included: NDArray[np.bool_]) -> Array:
         """Log odds (G,) of each group to be there, of the prior, given the others of a set."""
-        other_count = self.beside + is_included.sum() - is_included
+        other_count = is_included.sum() - is_included
         absent_count = np.maximum((1 + FEW_CAUSES) * self.count - other_count - 1, FEWEST_ABSENT)
         beside = np.where(self.alone, (is_included & self.alone).sum() - (is_included & self.alone), 0.0)
         return np.asarray(np.log((1 + other_count) / absent_count / self.share) - self.price) + NEVER * beside
@@ -275,8 +250,8 @@ class Sets:
             gain = 0.5 * (explained - np.sum(np.log1p(scaled), axis=2))
             if follow and (new := state.tau[members] == 0).any():
                 excess = fit.excess - state.unit * explained[new]
-                wider = np.log1p(scaled[new] * (state.unit / self.noise.units(excess))[..., None])
-                gain[new] = self.noise.log_likelihoods(excess) - now - 0.5 * np.sum(wider, axis=2)
+                wider = np.log1p(scaled[new] * (state.unit / self.noise.unit(excess))[..., None])
+                gain[new] = self.noise.log_likelihood(excess) - now - 0.5 * np.sum(wider, axis=2)
             gain += np.log(prior[kept])
             top = gain.max(axis=1, keepdims=True)
             share = np.exp(gain - top)

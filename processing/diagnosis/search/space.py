@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from scipy.linalg import block_diag
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
+from processing.instrument.model import InstrumentModel
 
 
 @dataclass
@@ -133,6 +134,10 @@ class Space:
         """Candidates, each with where its values stand in the common vector."""
         return list(zip(self.candidates, self.slices, strict=True))
 
+    def owner(self, position: int) -> int:
+        """Number of the candidate that a value of the common vector belongs to."""
+        return int(self._owner[position])
+
     def other_than_zero(self, values: Array) -> Iterator[tuple[Candidate, Array]]:
         """Candidates of which a value is not zero, each with its values, of the common vector (K,)."""
         for k in np.unique(self._owner[np.flatnonzero(values)]):
@@ -160,15 +165,30 @@ class Problem(Protocol):
 
     Attributes
     ----------
-    folds : parts that are held out in turn; `holds_out_states` says that the parts are states.
+    captures : each with a name, a wavelength, and whether it is simulated; model : the instrument.
+    folds : parts that are held out in turn; `holds_out_states` says that the parts are states, `held_out` it in words.
     noise_known : the excess is in units of a known noise.
     spread : see `Moments`.
     """
 
+    model: InstrumentModel
     folds: int
     noise_known: bool
     holds_out_states: bool
     spread: float
+
+    @property
+    def captures(self) -> Sequence[Any]: ...
+    @property
+    def held_out(self) -> str: ...
+
+    def noise_floor(self, space: Space, values: Array, k: int | None = None) -> float:
+        """Rms noise over the mean signal, of one capture or of all, with the counts corrected by these values."""
+        ...
+
+    def rows(self, k: int, space: Space, values: Array) -> Array:
+        """Measurement matrix W (L, 16) of a capture."""
+        ...
 
     def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
         """Excess, and with `derivatives` its half gradient and curvature, of every fold."""

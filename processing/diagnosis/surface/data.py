@@ -11,7 +11,7 @@ from scipy import ndimage
 from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.captures.read_capture import read_capture
-from processing.diagnosis.search.rules import FEWEST_OF_MANY, TILES
+from processing.diagnosis.search.rules import FEWEST_OF_MANY, FOLDS_OF_TILES, TILES
 from processing.diagnosis.surface.view import SurfaceView
 from processing.errors import ProcessError
 from processing.geometry.pinhole import PinholeCamera
@@ -34,9 +34,6 @@ MOST_OF_OBJECT = 4000
 RIM_OF_OBJECT = 0.06
 #: [pixels of the camera] The same, at least: the interpolation of a mosaic mixes as many.
 RIM_PX = 6
-
-#: [parts, fixed] Of the object that are held out in turn, as a chessboard has them.
-FOLDS = 2
 
 
 @dataclass(frozen=True)
@@ -167,7 +164,7 @@ def _tiles(where: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int6
     """Tile of each pixel (P, 2), and the part of a chessboard in which it is, each (P,)."""
     low = where.min(axis=0)
     tiles = (where - low) * TILES // (where.max(axis=0) - low + 1)
-    return tiles[:, 0] * TILES + tiles[:, 1], tiles.sum(axis=1) % FOLDS
+    return tiles[:, 0] * TILES + tiles[:, 1], tiles.sum(axis=1) % FOLDS_OF_TILES
 
 
 def _black_variance(capture: Capture) -> float:

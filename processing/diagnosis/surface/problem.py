@@ -16,26 +16,20 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.decision import in_deviations
-from processing.diagnosis.search.range_of import range_of, rank_of
-from processing.diagnosis.search.rules import FEWEST_OF_MANY
+from processing.diagnosis.search.range_of import NEARLY_ZERO, range_of, rank_of
+from processing.diagnosis.search.rules import FEWEST_OF_MANY, FOLDS_OF_TILES, STEP
 from processing.diagnosis.search.space import Space, Sums
-from processing.diagnosis.surface.data import FOLDS, SurfaceData
+from processing.diagnosis.surface.data import SurfaceData
 from processing.effect import Parameter
 from processing.errors import ProcessError
-from processing.instrument.applied_effects import apply_to, instrument_effects
+from processing.instrument.applied_effects import changes_of, instrument_effects
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
 
-#: [typical sizes] Step of a derivative.
-STEP = 1e-4
-#: [patterns, fixed] Smooth ones over an object that a misfit can have: up to second order in the position.
-PATTERNS = 6
 #: Tests of the residual: what some Mueller matrix could cause, and what none could.
 SMOOTH, OF_INSTRUMENT = "smooth over the object", "smooth over the object, of the instrument"
-#: [of the modelled light] Part of it that has to be polarized before it counts as a second column.
-LEAST_POLARIZED = 1e-6
 
 
 @dataclass(frozen=True)
@@ -77,7 +71,7 @@ class SurfaceProblem:
     holds_out_states = False
     noise_known = True
     spread = 1.0
-    folds = FOLDS
+    folds = FOLDS_OF_TILES
     held_out = "every tile of the object is predicted by a fit to the other tiles (2 parts, like a chessboard)"
 
     def __init__(self, model: InstrumentModel, captures: Sequence[SurfaceData]) -> None:
@@ -134,16 +128,14 @@ class SurfaceProblem:
         powers = []
         for k in range(len(self.captures)):
             w = self.rows(k, Space(()), np.zeros(0))
-            powers.append((max(rank_of(w) - 2, 1), np.ones(PATTERNS)))
+            # Up to second order in the position.
+            powers.append((max(rank_of(w) - 2, 1), np.ones(6)))
         return powers
 
     def changes(self, capture: int, space: Space, values: Array) -> tuple[Changes, ReflectanceChanges]:
         """Changes of the instrument, with its own effects, and of the reflectance."""
         data = self.captures[capture]
-        optics, surface = Changes(data.conditions), ReflectanceChanges()
-        for applied in self.model.effects:
-            if applied.scope == "instrument" or data.name in applied.captures:
-                apply_to(optics, self.model, applied)
+        optics, surface = changes_of(self.model, data.conditions, data.name), ReflectanceChanges()
         for candidate, part in space.pairs:
             effect = candidate.effect
             if isinstance(effect, ReflectanceEffect):
@@ -189,7 +181,7 @@ class SurfaceProblem:
         e = flat / length[:, None]
         f = columns - e * np.sum(e * columns, axis=1, keepdims=True)
         strength = np.sqrt(np.sum(f**2, axis=1))
-        modulates = strength > LEAST_POLARIZED * np.sqrt(np.sum(columns**2, axis=1))
+        modulates = strength > NEARLY_ZERO * np.sqrt(np.sum(columns**2, axis=1))
         f = np.where(modulates[:, None], f / np.maximum(strength, 1e-300)[:, None], 0.0)
         level, modulation = np.sum(e * y, axis=1), np.sum(f * y, axis=1)
         # Mean of q over each tile, from the same weighted squares.

@@ -54,12 +54,8 @@ def quantities(problem: SurfaceProblem, k: int, space: Space, values: Array) -> 
     return result, xi0
 
 
-def xi0_of(problem: SurfaceProblem, k: int, space: Space, values: Array) -> Array:
-    """xi0 (P,) of the pixels of a capture by the model with these values; NaN where it is noise."""
-    return _xi0(problem.pixels(k, space, values))
-
-
 def _xi0(pixels: SurfacePixels) -> Array:
+    """xi0 (P,) of the pixels of a capture; NaN where it is noise."""
     total = pixels.alpha_0 + pixels.alpha_id
     with np.errstate(divide="ignore", invalid="ignore"):
         xi0 = (pixels.alpha_0 + pixels.alpha_id / 4) / total
@@ -112,7 +108,7 @@ def change_of_xi0(problem: SurfaceProblem, solved: Solution, covariance: Array) 
 
 
 def _all_xi0(problem: SurfaceProblem, space: Space, values: Array) -> Array:
-    return np.concatenate([xi0_of(problem, k, space, values) for k in range(len(problem.captures))])
+    return np.concatenate([_xi0(problem.pixels(k, space, values)) for k in range(len(problem.captures))])
 
 
 def _mean(x: Array) -> float:

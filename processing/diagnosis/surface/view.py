@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay
 
 from processing.arrays import Array
+from processing.diagnosis.search.range_of import NEARLY_ZERO
 from processing.errors import ProcessError
 from processing.geometry.frames import ScatteringGeometry, dot, unit
 from processing.geometry.pinhole import PinholeCamera
@@ -31,8 +32,6 @@ SUPPORT_DEPTH = 2.0
 SUPPORT_PARTS = 16
 #: [pixels] Of a sphere, at one in so many of which the light of the support is computed.
 EVERY = 13
-#: [of a triangle] By which a pixel may be outside of it and still be in it.
-ON_EDGE = 1e-6
 #: [rad, fixed] Turn from one part of a disc to the next that spreads them evenly.
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 #: [answers] That are kept of each kind: a fit changes one value of many at a time.
@@ -203,7 +202,7 @@ class Between:
     def __init__(self, where: Array) -> None:
         self.nodes = np.union1d(np.arange(0, len(where), EVERY), ConvexHull(where).vertices)
         grid = Delaunay(where[self.nodes])
-        inside = np.maximum(grid.find_simplex(where, tol=ON_EDGE), 0)
+        inside = np.maximum(grid.find_simplex(where, tol=NEARLY_ZERO), 0)
         first = np.einsum("pij,pj->pi", grid.transform[inside, :2], where - grid.transform[inside, 2])
         self._weights = np.column_stack([first, 1 - first.sum(axis=1)])
         self._corners = grid.simplices[inside]

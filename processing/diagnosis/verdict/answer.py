@@ -2,10 +2,9 @@
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from processing.arrays import Array
@@ -27,9 +26,9 @@ from processing.diagnosis.search.result import (
     Ranked,
     Unexplained,
 )
-from processing.diagnosis.search.rules import MOST_RANKED, MOST_TRIED, NEEDED, SEEN, SMALL
+from processing.diagnosis.search.rules import MOST_RANKED, NEEDED, SEEN, SMALL
 from processing.diagnosis.search.space import Problem, Space
-from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel, SystematicError
+from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
 
 #: [correlation] From which on two values are told together.
 TOGETHER = 0.9
@@ -37,50 +36,11 @@ TOGETHER = 0.9
 OPEN = 5.0
 
 
-class CaptureInfo(Protocol):
-    """Properties of every capture in an answer."""
+def ties(values: Array, covariance: Array, typical: Array, told: Sequence[tuple[str, str]]) -> Iterator[Combination]:
+    """Groups of values (K,) that are known together much better than each by itself, of their covariance (K, K).
 
-    @property
-    def name(self) -> str: ...
-    @property
-    def simulated(self) -> bool: ...
-    @property
-    def wavelength_nm(self) -> float: ...
-
-
-class DiagnosisProblem(Problem, Protocol):
-    """A problem that an answer belongs to; `held_out` says in words what is predicted by what."""
-
-    model: InstrumentModel
-
-    @property
-    def captures(self) -> Sequence[CaptureInfo]: ...
-    @property
-    def held_out(self) -> str: ...
-
-    def noise_floor(self, space: Space, values: Array, k: int | None = None) -> float:
-        """Rms noise over the mean signal, of one capture or of all, with the counts corrected by these values."""
-        ...
-
-    def rows(self, k: int, space: Space, values: Array) -> Array:
-        """Measurement matrix W (L, 16) of a capture."""
-        ...
-
-
-@dataclass(frozen=True)
-class Tie:
-    """Values `index` (n,) of which weights @ values is determined to `stderr`; `open_by` (n,) is one standard deviation
-    of the direction that is determined least. The largest weight is one."""
-
-    index: NDArray[np.int64]
-    weights: Array
-    value: float
-    stderr: float
-    open_by: Array
-
-
-def ties(values: Array, covariance: Array, typical: Array) -> Iterator[Tie]:
-    """Groups of values (K,) that are known together much better than each by itself, of their covariance (K, K)."""
+    `told` : name and unit of each.
+    """
     error = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     alike = np.abs(covariance / np.outer(error, error)) > TOGETHER
     count, group = connected_components(alike, directed=False)
@@ -92,14 +52,15 @@ def ties(values: Array, covariance: Array, typical: Array) -> Iterator[Tie]:
         if size[-1] < OPEN**2 * max(size[0], 0.0):
             continue
         weights = vector[:, 0] / typical[index]
-        weights = weights / weights[np.argmax(np.abs(weights * error[index]))]
-        variance = weights @ covariance[np.ix_(index, index)] @ weights
-        yield Tie(
-            index,
-            weights,
-            float(weights @ values[index]),
-            float(np.sqrt(max(variance, 0.0))),
-            vector[:, -1] * np.sqrt(size[-1]) * typical[index],
+        largest = int(np.argmax(np.abs(weights * error[index])))
+        weights = weights / weights[largest]
+        names, open_by = [told[i][0] for i in index.tolist()], vector[:, -1] * np.sqrt(size[-1]) * typical[index]
+        yield Combination(
+            weights=dict(zip(names, weights.tolist(), strict=True)),
+            value=float(weights @ values[index]),
+            stderr=float(np.sqrt(max(weights @ covariance[np.ix_(index, index)] @ weights, 0.0))),
+            unit=told[int(index[largest])][1],
+            open_by=dict(zip(names, open_by.tolist(), strict=True)),
         )
 
 
@@ -107,31 +68,19 @@ def combinations(posterior: Posterior, solved: Solution) -> tuple[Combination, .
     """Combinations of the values of a correction that are only known together."""
     effects = set(solved.effects)
     at: list[int] = []
-    names: list[str] = []
-    units: list[str] = []
+    told: list[tuple[str, str]] = []
     for candidate, part in posterior.space.pairs:
         if candidate in effects and not candidate.effect.per_state:
             at += range(part.start, part.stop)
             single = candidate.size == 1
-            names += [candidate.label if single else f"{candidate.label} {p.name}" for p in candidate.parameters]
-            units += [p.unit for p in candidate.parameters]
+            told += [
+                (candidate.label if single else f"{candidate.label} {p.name}", p.unit) for p in candidate.parameters
+            ]
     typical = posterior.space.joined("typical")[at]
-    result = []
-    for tie in ties(posterior.values[at], posterior.covariance[np.ix_(at, at)], typical):
-        first = int(tie.index[np.argmin(np.abs(tie.weights - 1))])
-        result.append(
-            Combination(
-                weights={names[i]: float(w) for i, w in zip(tie.index, tie.weights, strict=True)},
-                value=tie.value,
-                stderr=tie.stderr,
-                unit=units[first],
-                open_by={names[i]: float(v) for i, v in zip(tie.index, tie.open_by, strict=True)},
-            )
-        )
-    return tuple(result)
+    return tuple(ties(posterior.values[at], posterior.covariance[np.ix_(at, at)], typical, told))
 
 
-def error(problem: DiagnosisProblem, solved: Solution, held_out: HeldOut, k: int | None = None) -> Error:
+def error(problem: Problem, solved: Solution, held_out: HeldOut, k: int | None = None) -> Error:
     """A residual as it is told, of one capture `k` or of all, in the unit of the counts as they were taken."""
     noise, rms, beyond = floor(problem, solved, k), 100 * held_out.rms, None
     if noise is not None:
@@ -140,14 +89,14 @@ def error(problem: DiagnosisProblem, solved: Solution, held_out: HeldOut, k: int
     return Error(rms_percent=rms, chi2_reduced=held_out.chi2_reduced, held_out=problem.held_out, beyond_noise=beyond)
 
 
-def floor(problem: DiagnosisProblem, solved: Solution, k: int | None = None) -> float | None:
+def floor(problem: Problem, solved: Solution, k: int | None = None) -> float | None:
     """Rms noise over the mean signal, percent, of the counts as they were taken: of one capture or of all."""
     if not problem.noise_known:
         return None
     return 100 * problem.noise_floor(solved.base, solved.before_fit.values, k)
 
 
-def stretch(problem: DiagnosisProblem, solved: Solution, k: int | None = None) -> float:
+def stretch(problem: Problem, solved: Solution, k: int | None = None) -> float:
     """By how much a bend of the response that is undone stretches noise, and residual, relative to the signal."""
     if not problem.noise_known:
         return 1.0
@@ -155,19 +104,21 @@ def stretch(problem: DiagnosisProblem, solved: Solution, k: int | None = None) -
     return problem.noise_floor(solved.space, solved.fit.values, k) / before if before > 0 else 1.0
 
 
-def held_out_without(problem: DiagnosisProblem, solved: Solution, effects: Collection[Candidate]) -> HeldOut:
+def held_out_without(problem: Problem, solved: Solution, effects: Collection[Candidate]) -> HeldOut:
     """Residual of the correction without some of its effects; for each degree of freedom, as after it."""
     values = solved.fit.values.copy()
     for candidate, part in solved.space.pairs:
         if candidate in effects:
             values[part] = 0.0
     sums = problem.sums(solved.space, values, derivatives=False)
-    more = float(sums.excess.sum()) - solved.fit.excess
-    return solved.after.and_more(more, float(sums.square.sum() - solved.fit.sums.square.sum()))
+    # Fits to other folds may end elsewhere than the fit to all, whose difference this is.
+    after, square = solved.after, float(sums.square.sum() - solved.fit.sums.square.sum())
+    excess = after.excess + float(sums.excess.sum()) - solved.fit.excess
+    return HeldOut(excess, after.freedom, max(after.square + square, 0.0), after.count)
 
 
 def effects_of_cause(
-    problem: DiagnosisProblem, solved: Solution, cause: Cause, doubt: str | None, *, not_applied: str | None
+    problem: Problem, solved: Solution, cause: Cause, doubt: str | None, *, not_applied: str | None
 ) -> list[FoundEffect]:
     """Effects of a cause for the answer, given a reason to doubt it; one for each capture in which it shows."""
     without = held_out_without(problem, solved, (*cause.candidates, *cause.alternatives))
@@ -207,7 +158,7 @@ def effects_of_cause(
     return effects
 
 
-def effects_of_switches(problem: DiagnosisProblem, solved: Solution) -> list[FoundEffect]:
+def effects_of_switches(problem: Problem, solved: Solution) -> list[FoundEffect]:
     """Effects that exclude pixels, because these contradict the others."""
     effects = []
     for candidate, part in solved.space.pairs:
@@ -219,14 +170,14 @@ def effects_of_switches(problem: DiagnosisProblem, solved: Solution) -> list[Fou
     return effects
 
 
-def _wavelength(problem: DiagnosisProblem, candidate: Candidate) -> float | None:
+def _wavelength(problem: Problem, candidate: Candidate) -> float | None:
     """Wavelength at which the values hold; None for all of them."""
-    several = {c.wavelength_nm for c in problem.captures}
+    several: set[float] = {c.wavelength_nm for c in problem.captures}
     effect = candidate.of_instrument
     if effect and problem.model.belongs_to.get(candidate.kind, effect.belongs_to) == "mechanics":
         return None
     if candidate.capture is not None:
-        return problem.captures[candidate.capture].wavelength_nm
+        return float(problem.captures[candidate.capture].wavelength_nm)
     return several.pop() if len(several) == 1 else candidate.wavelength_nm
 
 
@@ -248,7 +199,7 @@ def ranking(posterior: Posterior, before: HeldOut) -> tuple[Ranked, ...]:
     )
 
 
-def unobservable(problem: DiagnosisProblem, posterior: Posterior) -> list[Candidate]:
+def unobservable(problem: Problem, posterior: Posterior) -> list[Candidate]:
     """Candidates about which the captures say nothing, the nominal values being free."""
     precision, always = information(posterior)
     unseen = []
@@ -266,7 +217,7 @@ def unobservable(problem: DiagnosisProblem, posterior: Posterior) -> list[Candid
     return unseen
 
 
-def checks(problem: DiagnosisProblem, solved: Solution) -> tuple[Check, ...]:
+def checks(problem: Problem, solved: Solution) -> tuple[Check, ...]:
     """Held-out residual, rank and condition of W, before and after: if one gets worse, it is no explanation."""
     figures = [held_out_check(solved, stretch(problem, solved))]
     several, rows = len(problem.captures) > 1, []
@@ -289,7 +240,7 @@ class Answer:
     `problem` is what the correction predicts.
     """
 
-    problem: DiagnosisProblem
+    problem: Problem
     posterior: Posterior
     solved: Solution
     names: Names
@@ -351,7 +302,7 @@ class Answer:
             ),
             "recommendation": wanted_for_evidence(problem) if verdict == "undetermined" else recommended(),
             "unexplained": Unexplained(
-                description=tuple(descriptions), tried=tried or tuple(r.candidate for r in ranked[:MOST_TRIED])
+                description=tuple(descriptions), tried=tried or tuple(r.candidate for r in ranked[: MOST_RANKED // 2])
             )
             if verdict in ("unexplained", "partly_explained")
             else None,
