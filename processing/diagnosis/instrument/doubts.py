@@ -34,7 +34,7 @@ def doubts(
     static = _static_shifts(problem, solved, causes)
     even = Evenness(problem, solved.space, solved.fit.values)
     for cause in causes:
-        reason = STANDS if cause in static else _doubt_of(problem, solved, cause, causes=causes, even=even)
+        reason = STANDS if cause in static else _doubt_of(problem, solved, cause, even=even)
         if reason is not None:
             reasons[cause] = reason
     # What is something else took away a part of what is left over.
@@ -43,29 +43,17 @@ def doubts(
     return with_parts(posterior, causes, reasons, chi2=chi2, noise_known=problem.noise_known)
 
 
-def _doubt_of(
-    problem: InstrumentProblem,
-    solved: Solution,
-    cause: Cause,
-    *,
-    causes: Sequence[Cause],
-    even: Evenness,
-) -> str | None:
+def _doubt_of(problem: InstrumentProblem, solved: Solution, cause: Cause, *, even: Evenness) -> str | None:
     """The reason that a cause gives by itself, whatever is left of the others."""
     effect = cause.candidates[0].effect
     if at_bound(cause):
         return AT_BOUND
-    if effect.per_state:
-        if not testable(problem, solved, cause, causes):
-            return "as many values as the data have"
-        return None
-    if effect.of_source:
-        return OF_THE_SAMPLE if any(_uneven(even, solved, c, cause) for c in cause.candidates) else None
     # Channels that look at places apart leave something where the image is curved: that is not alike either.
-    alike = any(c.place_px is not None for c in problem.captures)
-    if not alike and any(_uneven(even, solved, c, cause) for c in cause.candidates):
-        return NOT_ALIKE
-    return None
+    apart = any(c.place_px is not None for c in problem.captures)
+    if effect.per_state or (apart and not effect.of_source):
+        return None
+    uneven = any(_uneven(even, solved, c, cause) for c in cause.candidates)
+    return (OF_THE_SAMPLE if effect.of_source else NOT_ALIKE) if uneven else None
 
 
 def find_changed(problem: InstrumentProblem, solved: Solution, doubt: Mapping[Cause, str]) -> set[int]:

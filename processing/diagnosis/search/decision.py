@@ -13,11 +13,9 @@ from scipy.special import ndtr
 
 from processing.arrays import Array
 from processing.diagnosis.search.fit import Solution
+from processing.diagnosis.search.range_of import NEARLY_ZERO
 from processing.diagnosis.search.result import Check, Verdict
 from processing.diagnosis.search.rules import CHANCE_WORSE, LEAST_CHANGE, LIMIT, LIMIT_OF_TWO, WORSE, WORSE_CONDITION
-
-#: [of the largest] Singular value of W from which on a direction is measured.
-MEASURED = 1e-6
 
 
 def held_out_check(solved: Solution, stretch: float = 1.0) -> Check:
@@ -39,7 +37,7 @@ def rows_checks(captures: Sequence[tuple[str, Array, Array]]) -> tuple[Check, ..
     figures: list[Check] = []
     for name, *matrices in captures:
         sizes = [np.linalg.svd(w, compute_uv=False) for w in matrices]
-        rank, new_rank = (int(np.sum(size > MEASURED * size[0])) for size in sizes)
+        rank, new_rank = (int(np.sum(size > NEARLY_ZERO * size[0])) for size in sizes)
         # A direction that the correction adds may be seen poorly: it was not seen at all before.
         condition, new_condition = (float(size[0] / max(size[rank - 1], 1e-300)) for size in sizes)
         figures += _rows_pair(name, (rank, new_rank), (condition, new_condition))
