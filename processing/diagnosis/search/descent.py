@@ -15,8 +15,6 @@ from processing.diagnosis.search.rules import CHANGES_BEFORE, EXACT, LITTLE, NOM
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Problem, Space
 
-#: [steps] Of a descent.
-STEPS = 6
 #: [times] That everything is linearized anew before groups are chosen.
 EXPANSIONS = 8
 
@@ -70,7 +68,6 @@ def descend(
     samples: Samples,
     *,
     starts: Sequence[Array],
-    steps: int = STEPS,
 ) -> Array:
     """Values (K,) at the minimum of chi-square and prior, of the groups that are likely to be there.
 
@@ -85,7 +82,7 @@ def descend(
         places = [x[positions] for x in starts]
         chi2 = [problem.sums(part, x, derivatives=False).excess.sum() + weak @ x**2 for x in places]
         best = places[int(np.argmin(np.nan_to_num(chi2, nan=np.inf)))]
-        values[positions] = minimize(problem, part, best, steps=steps, expansions=0, weak=weak).values
+        values[positions] = minimize(problem, part, best, expansions=0, weak=weak).values
     return values
 
 
@@ -101,7 +98,7 @@ def minimum_of(problem: Problem, space: Space, sets: Sets, state: State) -> Arra
     values = np.zeros(space.size)
     weak = state.unit / (tau * typical)[positions] ** 2
     start = (linear * typical)[positions]
-    values[positions] = minimize(problem, part, start, steps=STEPS, expansions=0, weak=weak).values
+    values[positions] = minimize(problem, part, start, expansions=0, weak=weak).values
     return values
 
 

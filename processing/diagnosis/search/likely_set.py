@@ -10,9 +10,6 @@ from processing.diagnosis.search.sets import NEVER, Sets, State
 
 #: [changes] That are tried one after the other without a gain before a climb ends, and instead of one group.
 PATIENCE = 8
-
-#: [changes] Of a set in one climb.
-STEPS = 60
 #: [1] One in so many of the groups without evidence is removed at once.
 AT_ONCE = 6
 
@@ -36,7 +33,7 @@ def climb(sets: Sets, state: State, without: int | None = None) -> State:
     state = sets.settled(state.copy())
     away = np.arange(len(sets.groups)) == without
     best, barred = sets.score(state), away.copy()
-    for _ in range(STEPS):
+    while True:
         c = sets.conditional(state, follow=True)
         is_included = state.tau > 0
         gain = np.where(sets.free & ~barred, np.where(is_included, -c.log_odds, c.log_odds), -np.inf)

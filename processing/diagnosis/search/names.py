@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Answer, Cause
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import CERTAIN, LIKELY, LITTLE, SURE, TIMES
+from processing.diagnosis.search.rules import LIKELY, LITTLE, NEEDED, SURE, TIMES
 
 AT_BOUND = "a value stands at its bound: the data ask for something else"
 #: Reasons that leave a name likely.
@@ -54,7 +54,7 @@ def with_parts(
         else:
             general = cause.candidates[0].effect.per_state or cause.candidates[0].is_pointwise
             directions = posterior.sets.noise.directions if general else 0.0
-            weak = cause.log_odds < max(CERTAIN, TIMES * directions / 2)
+            weak = cause.log_odds < max(2 * NEEDED, TIMES * directions / 2)
         # What the simple form of another cause leaves over is no cause of its own.
         weak |= any(cause.log_odds < o.candidates[0].effect.rough * o.log_odds for o in causes)
         if cause not in reasons and weak:

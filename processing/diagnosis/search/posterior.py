@@ -15,7 +15,6 @@ from processing.arrays import Array, BoolArray
 from processing.diagnosis.search.averages import Samples, likely_starts, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.descent import (
-    STEPS,
     all_at_once,
     alone,
     descend,
@@ -28,10 +27,7 @@ from processing.diagnosis.search.linearization import group_candidates, noise_of
 from processing.diagnosis.search.rules import (
     ALTERNATIVE,
     BENT,
-    CERTAIN,
     CHANGES,
-    FEWER_CHANGES,
-    FEWER_ROUNDS,
     GROWTH,
     NEEDED,
     ROUNDS,
@@ -102,7 +98,7 @@ def fit_posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], st
     """
     members, groups = group_candidates(space, fixed)
     about, sets, state, rivals = _expand(problem, space, fixed, members, groups=groups, start=start)
-    samples = stay(sets, likely_starts(sets, state), CHANGES if problem.noise_known else FEWER_CHANGES)
+    samples = stay(sets, likely_starts(sets, state), CHANGES)
     labels = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(labels) or 'nothing'}; unit of chi-square {state.unit:.3g}")
     return _posterior_of(problem, space, members, sets, samples=samples, about=about, rivals=rivals)
@@ -163,8 +159,7 @@ def _expand(
         single = [int(np.argmax(odds))] if odds.max() > NEEDED else []
     by_itself = [look(alone(problem, space, members[g]), np.arange(len(groups)) == g) for g in single]
     begun += [trial for trial in by_itself if trial is not None and trial.score > first.score]
-    rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
-    ended = [_settle(problem, space, trial, look, rounds=rounds) for trial in begun if trial is not None]
+    ended = [_settle(problem, space, trial, look) for trial in begun if trial is not None]
     last = max(ended, key=lambda trial: trial.score)
     problem.relinearize(space, last.about)
     down = problem.noise_known and last.state.unit <= BENT
@@ -196,18 +191,19 @@ def _of_bends(
         return {g for g in bends if trial.state.tau[g] > 0}
 
     # The noise was computed with the first of them, which is therefore preferred by more than its evidence.
-    best_groups, likely = groups_in(best), [groups_in(trial) for trial in rounds if trial.score > best.score - CERTAIN]
+    least, best_groups = best.score - 2 * NEEDED, groups_in(best)
+    likely = [groups_in(trial) for trial in rounds if trial.score > least]
     return best, {k: tuple(sorted({j for on in likely if k not in on for j in on - best_groups})) for k in best_groups}
 
 
-def _settle(problem: Problem, space: Space, first: _Round, look: Look, *, rounds: int) -> _Round:
-    """Linearize again about the new values, at most so many times, until they converge.
+def _settle(problem: Problem, space: Space, first: _Round, look: Look) -> _Round:
+    """Linearize again about the new values until they converge.
 
     Poorly determined values can drift together, out of the range of the linearization. So the iteration stops when the
     evidence falls below that of an earlier, verified round.
     """
     now, score = first, -np.inf
-    for _ in range(rounds - 1):
+    for _ in range(ROUNDS - 1):
         x, settled = next_values(problem, space, now.sets, now.state, x=now.about)
         if settled:
             break
@@ -239,5 +235,5 @@ def _posterior_of(
     sums = problem.sums(space, values, derivatives=False)
     if not sets.noise.unit(sums.chi2(problem.noise_known)) <= GROWTH * sets.noise.unit(sets.form.at(values / typical)):
         # The least certain values lie along a bent valley, in which the straight line to their mean does not stay.
-        values = descend(problem, space, sets.groups, samples, starts=[about], steps=2 * STEPS)
+        values = descend(problem, space, sets.groups, samples, starts=[about])
     return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical), rivals)

@@ -91,9 +91,6 @@ GROWTH = 1.05
 #: [typical sizes, or standard deviations] Up to which a straight line is exact enough: from where counts were corrected
 #: exactly, or where the problem was linearized.
 EXACT = 0.3
-#: [log odds] At which a group is certain and is not tested any more. A name needs as much where the residual alone
-#: measures the noise, since part of the residual may be structure.
-CERTAIN = 25.0
 
 # ---- correction ----------------------------------------------------------------------------------------------------
 #: [probability] From which on a group takes part in the correction that is written. What is less likely moves the mean
@@ -168,11 +165,7 @@ APART = 0.3
 STEP = 1e-4
 #: [rounds] Times that the problem is linearized anew about its solution.
 ROUNDS = 7
-#: [rounds] The same where the noise is not known: each makes what is left smaller, which is then taken for the noise.
-FEWER_ROUNDS = 4
 #: [changes] Of a chain in the last round.
-CHANGES = 1000
-#: [changes] The same where the noise is not known, of benches with many captures.
-FEWER_CHANGES = 300
+CHANGES = 300
 #: [changes] The same in the rounds before.
 CHANGES_BEFORE = 80

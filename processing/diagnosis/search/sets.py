@@ -150,10 +150,8 @@ class Sets:
         # The alternatives of one group count once.
         self.count = float(np.sum(np.exp(-self.price[self.free]) / self.share[self.free])) if count is None else count
         self.taus = TAU
-        # With unknown noise a better fit would count as smaller noise.
-        self.many = np.array([g.index.size >= MANY and noise.is_known for g in groups], dtype=bool)
-        self.tau_weight = np.where(self.many[:, None], TAU_WEIGHT_OF_MANY, TAU_WEIGHT)
         sizes = np.array([g.index.size for g in groups])
+        self.tau_weight = np.where((sizes >= MANY)[:, None], TAU_WEIGHT_OF_MANY, TAU_WEIGHT)
         #: Groups of one size, where their values stand (G, n), and the curvature (G, n, n) of each.
         self._alike: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
         for n in np.unique(sizes):
