@@ -58,7 +58,8 @@ def test_one_cause_that_does_what_two_do_has_its_share_from_either_side():
     half = 60 * np.random.default_rng(5).standard_normal((90, 4))
     design = np.hstack([half, half])
     causes = [*groups(2, 2), Group(np.arange(4, 8), price=5.5)]
-    sets = Sets(form(design, np.array([0.5, -0.4, 0.3, 0.5, 0, 0, 0, 0]), 2), causes, QUIET, count=400)
+    sets = Sets(form(design, np.array([0.5, -0.4, 0.3, 0.5, 0, 0, 0, 0]), 2), causes, QUIET)
+    sets.count = 400.0
     taus = np.array(list(product([0.0, *TAU], repeat=3)))
     scores = np.array([sets.fitted(State(tau)).score for tau in taus])
     weight = np.exp(scores - scores.max())

@@ -135,12 +135,9 @@ class Conditional(SetFit):
 
 
 class Sets:
-    """Sets of groups in one quadratic problem.
+    """Sets of groups in one quadratic problem; `count` is the number of groups that might be there."""
 
-    `count` is the number of groups that might be there, if these are not all of them.
-    """
-
-    def __init__(self, form: Quadratic, groups: Sequence[Group], noise: Noise, count: float | None = None) -> None:
+    def __init__(self, form: Quadratic, groups: Sequence[Group], noise: Noise) -> None:
         self.form, self.groups, self.noise = form, tuple(groups), noise
         self.free = np.array([g.fixed_tau is None for g in groups], dtype=bool)
         self.share = np.array([g.share for g in groups])
@@ -148,7 +145,7 @@ class Sets:
         self.alone = np.array([g.alone for g in groups], dtype=bool)
         self.size = form.gradient.size
         # The alternatives of one group count once.
-        self.count = float(np.sum(np.exp(-self.price[self.free]) / self.share[self.free])) if count is None else count
+        self.count = float(np.sum(np.exp(-self.price[self.free]) / self.share[self.free]))
         self.taus = TAU
         sizes = np.array([g.index.size for g in groups])
         self.tau_weight = np.where((sizes >= MANY)[:, None], TAU_WEIGHT_OF_MANY, TAU_WEIGHT)
