@@ -183,7 +183,9 @@ class CaptureData:
 
     def rows_of(self, model: InstrumentModel, changes: Changes | None = None) -> Array:
         """Rows (values_per_pixel, K) that the light of a pixel reaches: all 16 columns of W, one of a known sample."""
-        w = model.rows(self.conditions.angles_deg, changes).reshape(-1, 16) * self.row_exposure[:, None]
+        # Without a rotating element one row stands for all states.
+        w = model.rows(self.conditions.angles_deg, changes) * self.exposure[:, None, None]
+        w = w.reshape(-1, 16)
         return w if self.sample is None else (w @ self.sample)[:, None]
 
     def variance(self, rows: slice = slice(None)) -> Array:
