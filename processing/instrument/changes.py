@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,6 +98,15 @@ def _zeros() -> defaultdict[str, Array]:
     return defaultdict(lambda: np.zeros(()))
 
 
+@lru_cache(maxsize=64)
+def _nothing(states: int, channels: int) -> tuple[Array, Array, Array]:
+    """Gain, shift and blur that change nothing: one object, so that who adds changes sees what has none."""
+    arrays = np.ones((states, channels)), np.zeros((states, 2)), np.zeros(states)
+    for array in arrays:
+        array.flags.writeable = False
+    return arrays
+
+
 @dataclass
 class Changes:
     """Sum of what all effects ask for; an empty one is the model as it stands.
@@ -132,9 +142,7 @@ class Changes:
     built: dict[tuple[str, bytes], Array] | None = None
 
     def __post_init__(self) -> None:
-        self.gain = np.ones((self.conditions.states, len(self.conditions.channels)))
-        self.shift_px = np.zeros((self.conditions.states, 2))
-        self.blur_px2 = np.zeros(self.conditions.states)
+        self.gain, self.shift_px, self.blur_px2 = _nothing(self.conditions.states, len(self.conditions.channels))
 
     def of_states(self, chosen: NDArray[np.int64]) -> "Changes":
         """The same for some of the states, by their positions."""
@@ -163,8 +171,10 @@ class Changes:
     def key(self, element: str, azimuth_rad: Array) -> tuple[str, bytes]:
         """Key of all changes on which the Mueller matrices of an element depend, without its own values."""
         kinds = (self.retardance_rad, self.extinction, self.diattenuation, self.depolarization)
-        parts = (azimuth_rad, *(change[element] for change in kinds))
-        return element, b"|".join(np.asarray(p, dtype=float).tobytes() for p in parts)
+        parts = (change.get(element) for change in kinds)
+        return element, b"|".join(
+            [azimuth_rad.tobytes(), *(b"" if p is None else np.asarray(p, float).tobytes() for p in parts)]
+        )
 
     def add(self, other: "Changes") -> None:
         """Add what others ask for, of the same conditions."""
@@ -178,11 +188,15 @@ class Changes:
             self.precede(element, mueller)
         if other.mixing is not None:
             self.mixing = other.mixing if self.mixing is None else other.mixing @ self.mixing
-        self.gain = self.gain * other.gain
+        gain, shift_px, blur_px2 = _nothing(self.conditions.states, len(self.conditions.channels))
+        if other.gain is not gain:
+            self.gain = self.gain * other.gain
+        if other.shift_px is not shift_px:
+            self.shift_px = self.shift_px + other.shift_px
+        if other.blur_px2 is not blur_px2:
+            self.blur_px2 = self.blur_px2 + other.blur_px2
         self.stray = self.stray + other.stray
         self.lag += other.lag
-        self.shift_px = self.shift_px + other.shift_px
-        self.blur_px2 = self.blur_px2 + other.blur_px2
         self.drop_clipped = self.drop_clipped or other.drop_clipped
 
     def turn_axis(self, axis: str, error_deg: Array, elements: Mapping[str, float]) -> None:

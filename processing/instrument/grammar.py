@@ -7,6 +7,7 @@ axis of an element or that of an element before it: light does not go back.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -150,6 +151,7 @@ class Sentence:
             _add(changes, model, self.site, quantity, part=part)
 
 
+@lru_cache(maxsize=4096)
 def parse_sentence(text: str) -> Sentence:
     """The sentence of a text.
 

@@ -329,7 +329,8 @@ def _matrices(element: Element, angles_deg: Mapping[str, ArrayLike], states: int
     azimuth = element.azimuth_rad(angles_deg, states)
     if changes is None:
         return element.mueller(azimuth)
-    azimuth = azimuth + changes.azimuth_rad[element.name]
+    if element.name in changes.azimuth_rad:
+        azimuth = azimuth + changes.azimuth_rad[element.name]
     key = changes.key(element.name, azimuth) if changes.built is not None else None
     if changes.built is not None and key in changes.built:
         matrix = changes.built[key]
@@ -343,7 +344,7 @@ def _matrices(element: Element, angles_deg: Mapping[str, ArrayLike], states: int
 
 
 def _detected(w: Array, changes: Changes) -> Array:
-    if np.any(changes.stray):
+    if changes.stray if isinstance(changes.stray, float) else np.any(changes.stray):
         # Light that no element modulates: the same for every state, as strong as the fraction of the mean signal.
         w = w.copy()
         w[..., 0] += np.reshape(changes.stray, (-1, 1)) * float(np.mean(w[..., 0]))
