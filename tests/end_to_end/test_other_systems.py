@@ -38,7 +38,10 @@ def test_import_reduce_and_diagnose_where_linux_has_no_part(tmp_path, configs):
     import_line = ("process", "import", "--states", states, "--out", "mirror.h5", *sample)
     steps = (("process", command, "mirror.h5") for command in ("reduce", "xi0", "quantities", "report"))
     refused = ("process", "export", "mirror.mueller.h5", "--to", "csv")
-    words = [[str(word) for word in line] for line in (import_line, *steps, ("diagnose", "mirror.h5"), refused)]
+    words = [
+        [str(word) for word in line]
+        for line in (import_line, *steps, ("diagnose", "mirror.h5", "--json", "said.json"), refused)
+    ]
     # In one program: it is loaded once.
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", WITHOUT],
@@ -50,6 +53,8 @@ def test_import_reduce_and_diagnose_where_linux_has_no_part(tmp_path, configs):
     )
     assert done.returncode == 0, done.stderr[-3000:]
     assert "residual 1.42 % -> 0.1" in done.stdout
+    found = {effect["kind"] for effect in json.loads((tmp_path / "said.json").read_text())["effects"]}
+    assert {"path_retardance", "retarder_transmission", "analyzer_transmission", "rotation_eccentricity"} <= found
     assert done.stdout.endswith("['process', 'export'] 2\n")
     assert done.stdout.count("['") == 1
     assert "needs xarray: pip install 'umov[xarray]'" in done.stderr

@@ -16,8 +16,7 @@ from processing.diagnosis.instrument_file import extend_model
 from processing.diagnosis.search.fit import minimize, prior
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
-from processing.public_data.conversion import PublicStates, mirror_means, single_detector, tables_of
-from processing.public_data.sets import SHIPPED
+from processing.public_data.conversion import PublicStates, single_detector, tables_of
 from processing.storage.captures.capture import Capture
 from processing.storage.formats.import_request import ImportRequest, read_sample
 from processing.storage.formats.importing import import_capture
@@ -52,7 +51,7 @@ def wollaston(public_files, folder: Path, instrument: Path, wavelength_nm: int) 
 @pytest.mark.parametrize(
     ("wavelength_nm", "least", "most", "sure"),
     [
-        (1200, 0.2, 0.32, {"psg_extinction"}),
+        (1200, 0.2, 0.27, {"psg_extinction"}),
         # A value for each intensity would leave 0.001 %, which says nothing.
         (1300, 0.1, 0.25, set()),
         (1950, 0.2, 0.45, {"generator_ellipticity"}),
@@ -64,17 +63,9 @@ def test_wollaston_at_other_wavelengths(public_files, configs, tmp_path, wavelen
     d = diagnose_captures([path], InstrumentModel.load(instrument))[0].diagnosis
     assert least < d.error_after.rms_percent < most
     assert sure <= {e.kind for e in d.effects if e.confident}
-
-
-def test_where_the_source_counts_for_nothing_the_ratio_is_all(public_files, configs, tmp_path):
-    """46 ratios at 1200 nm, of which a level of the source for each state takes nothing."""
-    instrument = configs / "instruments/drr_wollaston.yaml"
-    path, _ = wollaston(public_files, tmp_path, instrument, 1200)
-    d = diagnose_captures([path], InstrumentModel.load(instrument))[0].diagnosis
     assert d.correction.refused is None
-    assert 0.1 < d.error_after.rms_percent < 0.27
-    assert d.error_before.rms_percent > 2 * d.error_after.rms_percent
-    assert any(e.confident for e in d.effects)
+    # At 1300 nm no cause is left.
+    assert not sure or d.error_before.rms_percent > 2 * d.error_after.rms_percent
 
 
 def telescope(public_files, folder: Path, instrument: Path) -> dict[int, Path]:
@@ -186,18 +177,6 @@ def test_wollaston_the_source_is_the_cause(public_files, configs, tmp_path):
     # The values hold for all states together, not only for each part that was held out.
     image_sums = problem.undivided().sums(judged.solution.space, judged.solution.fit.values, derivatives=False)
     assert np.sqrt(image_sums.square.sum() / image_sums.count.sum()) < 0.003
-
-
-@pytest.mark.long
-@pytest.mark.timeout(900)
-def test_mirror_frames_down_to_a_quarter_percent(configs, tmp_path):
-    instrument = configs / "instruments/drr_imaging_630nm.yaml"
-    path = imported(tmp_path, mirror_means(SHIPPED / "drr-imaging-630nm/roi_stats_630nm.csv"), instrument)
-    d = diagnose_captures([path], InstrumentModel.load(instrument))[0].diagnosis
-    assert d.error_before.rms_percent == pytest.approx(1.42, abs=0.03)
-    assert d.error_after.rms_percent < 0.25
-    kinds = {e.kind for e in d.effects}
-    assert {"path_retardance", "retarder_transmission", "analyzer_transmission", "rotation_eccentricity"} <= kinds
 
 
 @pytest.mark.long
