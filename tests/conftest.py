@@ -32,7 +32,7 @@ LEFT_OUT = pytest.StashKey[int]()
 def pytest_addoption(parser: pytest.Parser) -> None:
     """`--rig FILE` names the rig that tests/hardware may move; `--all` runs the tests marked `long` as well."""
     parser.addoption("--rig", default=None, help="rig file of real hardware for tests/hardware")
-    parser.addoption("--all", action="store_true", help="run the tests marked `long` as well, as CI does")
+    parser.addoption("--all", action="store_true", help="run the tests marked `long` as well")
 
 
 @pytest.fixture(scope="session", autouse=True)
