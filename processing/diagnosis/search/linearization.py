@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import eigh
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
@@ -73,13 +74,14 @@ def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic
 
 
 def _without_negative(h: Array) -> Array:
-    """The matrix without its negative eigenvalues; a root, which is quick, shows whether there are any."""
+    """The matrix without its negative eigenvalues beyond rounding; a root, which is quick, shows whether there are any."""
     rounding = h.shape[0] * np.finfo(float).eps * float(h.diagonal().max(initial=0.0))
     try:
         np.linalg.cholesky(h + rounding * np.eye(h.shape[0]))
     except np.linalg.LinAlgError:
-        value, vector = np.linalg.eigh(h)
-        return np.asarray((vector * np.maximum(value, 0.0)) @ vector.T)
+        # Hundreds are zero but for rounding. Their vectors would take most of the time.
+        value, vector = eigh(h, driver="evr", subset_by_value=(-np.inf, -rounding), check_finite=False)
+        return np.asarray(h - (vector * value) @ vector.T)
     return h
 
 

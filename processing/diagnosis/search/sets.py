@@ -264,12 +264,12 @@ class Sets:
         """Groups of one size, with curvature (G, n, n) and gradient (G, n) about zero given all other groups."""
         where = np.full(self.size, -1)
         where[fit.active] = np.arange(fit.active.size)
+        # What the groups that are there take from each value.
+        taken = self.form.curvature[fit.active].T @ (inverse.T / state.unit)
         for members, index, own_curvature in self._alike:
             s, q = own_curvature / state.unit, self.form.gradient[index] / state.unit
             is_included = state.tau[members] > 0
-            others = index[~is_included]
-            across = self.form.curvature[np.ix_(others.ravel(), fit.active)] @ (inverse.T / state.unit)
-            part = across.reshape(*others.shape, fit.active.size)
+            part = taken[index[~is_included]]
             s[~is_included] -= part @ part.transpose(0, 2, 1)
             q[~is_included] -= part @ right
             # The posterior of a group that is there is its prior times what the others leave it.
