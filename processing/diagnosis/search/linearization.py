@@ -74,7 +74,7 @@ def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic
 
 
 def _without_negative(h: Array) -> Array:
-    """The matrix without its negative eigenvalues beyond rounding; a root, which is quick, shows whether there are any."""
+    """The matrix without its negative eigenvalues beyond rounding; a root, which is quick, shows if there are any."""
     rounding = h.shape[0] * np.finfo(float).eps * float(h.diagonal().max(initial=0.0))
     try:
         np.linalg.cholesky(h + rounding * np.eye(h.shape[0]))
