@@ -55,11 +55,10 @@ class CountsCorrection:
 
 
 def full_scale(capture: Capture, states: NDArray[np.int64]) -> float:
-    """Top of the range above black, counts; for floating frames, their largest value."""
-    detector = capture.header.detector
-    if capture.integer_counts and detector.bits:
-        return float(2**detector.bits - 1) - detector.black_level_counts
-    return float(max(np.nanmax(capture.frames(int(k))) for k in states)) - detector.black_level_counts
+    """Top of the range above black, counts; the largest value of frames whose bits are not known."""
+    if (top := capture.header.detector.range_counts) is not None:
+        return top
+    return float(max(np.nanmax(capture.frames(int(k))) for k in states)) - capture.header.detector.black_level_counts
 
 
 def capture_changes(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> Changes | None:

@@ -117,6 +117,18 @@ def test_counts_are_corrected(rgb950: InstrumentModel, synthetic_capture) -> Non
     assert error(reduced(path, real), truth) < 5e-4
 
 
+def test_means_of_counts_have_the_range_of_the_counts(rgb950: InstrumentModel, synthetic_capture) -> None:
+    """What was found in whole counts corrects their means, which are floating and fill half of the range."""
+    truth = smooth_scene()
+    light = np.einsum("nck,kxy->ncxy", rgb950.rows(ANGLES), truth.reshape(16, *SHAPE))
+    truth, light = truth * 2000 / light.max(), light * 2000 / light.max()
+    bent = (light * (1 - 0.05 * light / 4095)).astype(np.float32)
+    path = synthetic_capture(bent, ANGLES, title="test", detector={"bits": 12})
+    real = rgb950.model_copy(update={"effects": (effect("detector_nonlinearity", lost_at_full_scale=0.05),)})
+    assert error(reduced(path, rgb950), truth) > 0.005
+    assert error(reduced(path, real), truth) < 5e-4
+
+
 def test_light_that_moves_over_the_image_is_levelled(rgb950: InstrumentModel, synthetic_capture) -> None:
     truth = smooth_scene()
     light = np.einsum("nck,kxy->ncxy", rgb950.rows(ANGLES), truth.reshape(16, *SHAPE))

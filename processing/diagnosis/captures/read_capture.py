@@ -172,8 +172,8 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     if cut_off.all():
         raise CaptureError(f"{capture.path}: the counts of every state are cut off at zero. Raise the black level.")
     names = tuple(c.name for c in model.channels)
-    detector, integer = capture.header.detector, capture.integer_counts
-    top = float(2**detector.bits - 1) - detector.black_level_counts if integer and detector.bits else frames.top
+    detector = capture.header.detector
+    top = frames.top if detector.range_counts is None else detector.range_counts
     angles = {name: value[states] for name, value in capture.angles_deg.items()}
     host_s, camera_s = capture.column("host_time_s")[states], capture.column("camera_time_ns")[states] * 1e-9
     when, when_error = elapsed(host_s, len(states)), elapsed_error(host_s, camera_s)
@@ -203,7 +203,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         cut_off=tuple(np.flatnonzero(cut_off).tolist()),
     )
     repeats = np.maximum(capture.column("repeats")[states].astype(float), 1)
-    noise = NoiseModel.of(detector, integer)
+    noise = NoiseModel.of(detector, capture.integer_counts)
     if noise is not None:
         excess = correction.black.excess(noise, capture.column("exposure_s")[states])
         slope, floor = noise.slope / repeats / top, noise.averaged_floor(repeats, excess) / top**2

@@ -131,6 +131,11 @@ class Detector(FiniteSection):
     full_well_e: float | None = Field(default=None, gt=0, description="electrons that a pixel holds")
     bits: int | None = Field(default=None, ge=1, le=32, description="bits of a count; full scale is 2**bits - 1")
 
+    @property
+    def range_counts(self) -> float | None:
+        """Counts from black to full scale; None where the bits are not known."""
+        return None if self.bits is None else float(2**self.bits - 1) - self.black_level_counts
+
 
 class CaptureHeader(FiniteSection):
     """Everything about a capture that is known before its first state."""
