@@ -1,4 +1,4 @@
-"""Intervals of the coherency eigenvalues and of what follows from them: entropy, dominant process, symmetric elements.
+"""Intervals of the coherency eigenvalues and of what follows from them: entropy, symmetric elements.
 
 Noise pushes equal eigenvalues apart, so that errors to first order are too small, and values far off. `intervals` says
 which planes hold an interval.
@@ -9,15 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from processing.arrays import Array, RealArray
-from processing.maps.intervals import SEEN, Planes, put
+from processing.maps.intervals import Planes, put
 from processing.polarization.eigenvalue_noise import CorrectedXi0, EigenvalueNoise
 from processing.polarization.magnitude import NORMAL_95, interval, positive
 from processing.polarization.quantities import entropy
 from processing.polarization.sorted_eigenvalues import of_gaps, of_singular_values
 from processing.storage.products.images import MuellerImage
 
-#: Equal eigenvalues are seen apart by the noise between them times the root of this, on average.
-_REPELLED = 4.0
 #: Parts of the light not in the dominant process between which entropy passes from that of a nearly pure sample to that
 #: of a depolarizer.
 PURE = (0.15, 0.45)
@@ -146,22 +144,3 @@ def set_symmetric(planes: Planes, relative: Array, components: float) -> None:
         bounds = np.maximum(value[k] - shifts.below[k], -1.0), np.minimum(value[k] + shifts.above[k], 1.0)
         low, high = (np.where(is_finite, b, end) for b, end in zip(bounds, (-1.0, 1.0), strict=True))
         put(planes, name, value[k], shifts.half[k], low, high)
-
-
-def widen_dominant(planes: Planes, noise: EigenvalueNoise, uneven: float) -> Array:
-    """Errors of the dominant process for the gap without noise, which pushes eigenvalues apart.
-
-    `set_eigenvalues` is done. Returns the factor (...), NaN where the process is not determined.
-
-    Parameters
-    ----------
-    uneven : noise of the noisiest directions over that of all.
-    """
-    xi = planes["coherency_eigenvalues"].astype(float)
-    gap, coupling = xi[0] - xi[1], uneven * noise.coupling
-    # Two processes whose eigenvalues were equal would be seen this far apart.
-    apparent = (gap + np.sqrt(gap**2 + 4 * _REPELLED * coupling**2)) / 2
-    factor = np.where(gap > SEEN * coupling, apparent / gap, np.nan)
-    for name in [n for n in planes if n.startswith("dominant_") and not n.endswith("_errors")]:
-        planes[f"{name}_errors"] = planes[f"{name}_errors"] * factor.astype(np.float32)
-    return factor

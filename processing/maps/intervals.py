@@ -56,7 +56,7 @@ def set_magnitudes(
     m: Array,
     image: ElementNoise,
     *,
-    widened: Array | float = 1.0,
+    turn: Array | float = 0.0,
     noises: Mapping[str, VectorNoise] | None = None,
 ) -> None:
     """Replace value and error of every length of a vector and of every angle, and add their 95 % intervals.
@@ -64,7 +64,7 @@ def set_magnitudes(
     Parameters
     ----------
     m : (..., 4, 4), the matrices of which `derived` is.
-    widened : (...), factor by which the errors of the dominant process are larger than to first order.
+    turn : (...), variance of the element of the dominant process that noise turns most.
     noises : noise of vectors that is known already, by the name of their length.
     """
     covariance = image.covariance()
@@ -80,13 +80,31 @@ def set_magnitudes(
             vector, scale = quantity.parts.value, np.ones(())
             noise = (noises or {}).get(name) or of_slopes(covariance, vector, quantity.parts.gradient)
         if name.startswith("dominant_"):
-            scale = scale * np.square(widened)
+            # Of the 68 and of the 95 % interval.
+            wide, far = _turned(turn, 1.0), _turned(turn, NORMAL_95)
+            noise = VectorNoise(
+                wide * noise.along,
+                wide * noise.total,
+                wide**2 * noise.square,
+                far * noise.below,
+                far * noise.above,
+                far * noise.packed,
+            )
         length = np.asarray(quantity.value, dtype=float)
         moments = (scale * noise.along, scale * noise.total, scale**2 * noise.square)
         put(planes, name, *interval(length, *moments, below=scale * noise.below, above=scale * noise.above))
         for angle in ANGLES_OF.get(name, ()):
             if angle in planes:
                 _set_angle(planes, angle, length * vector / np.hypot(*vector), scale * noise.packed[[0, 1, 3]])
+
+
+def _turned(turn: Array | float, deviate: float) -> Array:
+    """Variance of an element of the dominant process at so many errors from the truth, over that to first order.
+
+    An element is a sine x: the gap that is seen makes the sine of twice the turn of two eigenvectors exact. To first
+    order its variance is that of no turn times 1 - x^2. `turn` is the variance of x where noise turns it most.
+    """
+    return np.asarray(1 + deviate**2 * turn)
 
 
 def _set_angle(planes: Planes, name: str, vector: Array, covariance: Array) -> None:
@@ -333,8 +351,14 @@ def set_differential(planes: Planes, is_determined: NDArray[np.bool_]) -> None:
         put(planes, name, value, half, *np.where(is_determined, bounds, np.stack([low, high])))
 
 
-def set_any_dominant(planes: Planes, derived: Mapping[str, Derived], is_determined: NDArray[np.bool_]) -> None:
-    """Every process is in the intervals where the dominant one is not determined. The others are done."""
+def set_dominant(planes: Planes, derived: Mapping[str, Derived], turn: Array, is_determined: NDArray[np.bool_]) -> None:
+    """Every process is in the intervals where the dominant one is not determined. `set_magnitudes` is done."""
+    # For pulls of 1, as m0 has no stored interval: the mean square of a pull grows as at sqrt(3) errors.
+    planes["dominant_mueller_jones_errors"] *= np.sqrt(_turned(turn, np.sqrt(3))).astype(np.float32)
+    for name in ("dominant_diattenuation_circular", "dominant_polarizance_circular"):
+        value, error = planes[name], planes[f"{name}_errors"]
+        half, far = (error * np.sqrt(_turned(turn, deviate)) for deviate in (1.0, NORMAL_95))
+        put(planes, name, value, half, value - NORMAL_95 * far, value + NORMAL_95 * far)
     if is_determined.all():
         return
     for name in [n for n in derived if n.startswith("dominant_")]:

@@ -251,6 +251,16 @@ def test_entropy_covers_at_both_its_ends_and_where_an_eigenvalue_may_be_zero(ins
     assert electrons == 60 or np.median([cell.rms for cell in rows]) == pytest.approx(1, abs=0.1)
 
 
+def test_intervals_of_the_dominant_process_are_not_too_long() -> None:
+    """The median of the 68 % intervals covered 79 %."""
+    samples = ["air", "mirror", "retarder 2", "retarder 90", "retarder 180"]
+    found = cells("60 and 150 degrees, 4.3 to 1, 36", 4, 60, 400, samples=samples, extra=())
+    table = [c for c in found if c.quantity.startswith("dominant_") and c.all_95 < 0.05]
+    assert len(table) > 20
+    assert 0.64 < np.median([c.in_68 for c in table]) < 0.75
+    assert min(c.in_95 for c in table) > 0.88
+
+
 def test_an_axis_that_is_not_determined_has_its_whole_period_about_its_value() -> None:
     """That of the differential decomposition had 0 to 180 degrees, which counts as a miss where it passes 180."""
     table = cells("127 degrees, 9 to 1, 41", 0, 60, 200, samples=["retarder 2"], first_seed=21)
