@@ -79,23 +79,18 @@ def set_magnitudes(
         else:
             vector, scale = quantity.parts.value, np.ones(())
             noise = (noises or {}).get(name) or of_slopes(covariance, vector, quantity.parts.gradient)
+        wide, far, of_68 = scale, scale, np.ones(())
         if name.startswith("dominant_"):
             # Of the 68 and of the 95 % interval.
-            wide, far = _turned(turn, 1.0), _turned(turn, NORMAL_95)
-            noise = VectorNoise(
-                wide * noise.along,
-                wide * noise.total,
-                wide**2 * noise.square,
-                far * noise.below,
-                far * noise.above,
-                far * noise.packed,
-            )
+            by = [_turned(turn, deviate) for deviate in (1.0, NORMAL_95)]
+            wide, far, of_68 = scale * by[0], scale * by[1], np.sqrt(by[0] / by[1])
         length = np.asarray(quantity.value, dtype=float)
-        moments = (scale * noise.along, scale * noise.total, scale**2 * noise.square)
-        put(planes, name, *interval(length, *moments, below=scale * noise.below, above=scale * noise.above))
+        moments = (wide * noise.along, wide * noise.total, wide**2 * noise.square)
+        put(planes, name, *interval(length, *moments, below=far * noise.below, above=far * noise.above))
         for angle in ANGLES_OF.get(name, ()):
             if angle in planes:
-                _set_angle(planes, angle, length * vector / np.hypot(*vector), scale * noise.packed[[0, 1, 3]])
+                direction = length * vector / np.hypot(*vector)
+                _set_angle(planes, angle, direction, far * noise.packed[[0, 1, 3]], of_68=of_68)
 
 
 def _turned(turn: Array | float, deviate: float) -> Array:
@@ -107,9 +102,9 @@ def _turned(turn: Array | float, deviate: float) -> Array:
     return np.asarray(1 + deviate**2 * turn)
 
 
-def _set_angle(planes: Planes, name: str, vector: Array, covariance: Array) -> None:
+def _set_angle(planes: Planes, name: str, vector: Array, covariance: Array, *, of_68: Array) -> None:
     """Fieller's interval for the direction of vectors (2, ...): all directions where they may be zero."""
-    direction = directions(vector, covariance, both_ends=name == EITHER_AXIS)
+    direction = directions(vector, covariance, both_ends=name == EITHER_AXIS, of_68=of_68)
     half, low, high = (np.rad2deg(part) / 2 for part in direction)
     value = planes[name]
     put(planes, name, value, half, value + low, value + high)

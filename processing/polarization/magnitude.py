@@ -107,7 +107,7 @@ class Directions(NamedTuple):
     high: Array
 
 
-def directions(vector: Array, covariance: Array, both_ends: bool = False) -> Directions:
+def directions(vector: Array, covariance: Array, both_ends: bool = False, of_68: Array | float = 1.0) -> Directions:
     """Intervals of the directions of vectors (2, ...) with this covariance (3, ...), 00, 11, 01, after Fieller.
 
     A direction is rejected where the vector's component across it is beyond its error, which is exact at any length and
@@ -116,6 +116,7 @@ def directions(vector: Array, covariance: Array, both_ends: bool = False) -> Dir
     Parameters
     ----------
     both_ends : a direction and its opposite count as one.
+    of_68 : (...), errors for the 68 % interval over those for the 95 % interval, which `covariance` has.
 
     Examples
     --------
@@ -129,7 +130,7 @@ def directions(vector: Array, covariance: Array, both_ends: bool = False) -> Dir
     determinant = np.maximum(xx * yy - xy**2, 0.0)
     across = np.maximum(x**2 * yy + y**2 * xx - 2 * x * y * xy, 0.0)
     ends = []
-    for deviate, limit in zip((1.0, NORMAL_95), ANY_DIRECTION, strict=True):
+    for deviate, limit in ((of_68, ANY_DIRECTION[0] * of_68), (NORMAL_95, ANY_DIRECTION[1])):
         a, d = x**2 - deviate**2 * xx, y**2 - deviate**2 * yy
         p, q = (a - d) / 2, x * y - deviate**2 * xy
         half = np.arctan2(deviate * np.sqrt(np.maximum(across - deviate**2 * determinant, 0.0)), (a + d) / 2) / 2
