@@ -153,11 +153,6 @@ class CaptureData:
         return int(self.signal.shape[0] * self.signal.shape[1])
 
     @property
-    def row_exposure(self) -> Array:
-        """Exposure (values_per_pixel,) of each row of W."""
-        return np.repeat(self.exposure, self.signal.shape[1])
-
-    @property
     def row_counts(self) -> NDArray[np.bool_]:
         """(values_per_pixel,) whether a row of W counts."""
         counts = np.ones(self.conditions.states, dtype=bool)
@@ -181,11 +176,15 @@ class CaptureData:
         place = np.zeros((self.signal.shape[1], 2)) if self.place_px is None else self.place_px
         return np.asarray(shift_px[:, None] - place)
 
-    def rows_of(self, model: InstrumentModel, changes: Changes | None = None) -> Array:
-        """Rows (values_per_pixel, K) that the light of a pixel reaches: all 16 columns of W, one of a known sample."""
+    def matrix_of(self, model: InstrumentModel, changes: Changes | None = None) -> Array:
+        """Measurement matrix W (values_per_pixel, 16), each row for the exposure of its state."""
         # Without a rotating element one row stands for all states.
         w = model.rows(self.conditions.angles_deg, changes) * self.exposure[:, None, None]
-        w = w.reshape(-1, 16)
+        return w.reshape(-1, 16)
+
+    def rows_of(self, model: InstrumentModel, changes: Changes | None = None) -> Array:
+        """Rows (values_per_pixel, K) that the light of a pixel reaches: all 16 columns of W, one of a known sample."""
+        w = self.matrix_of(model, changes)
         return w if self.sample is None else (w @ self.sample)[:, None]
 
     def variance(self, rows: slice = slice(None)) -> Array:

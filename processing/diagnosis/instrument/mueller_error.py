@@ -93,7 +93,7 @@ def _without_levels(w: Array, m: Array, channels: int) -> Array:
 
 def _all_columns(problem: InstrumentProblem, k: int, changes: Changes) -> Array:
     """Rows (L, 16) of the measurement matrix in units of their noise, whatever the sample."""
-    w = problem.rows_of(k, changes) * problem.captures[k].row_exposure[:, None]
+    w = problem.captures[k].matrix_of(problem.models[k], changes)
     return np.asarray(w / problem.moments[k].sigma[:, None])
 
 

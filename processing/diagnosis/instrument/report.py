@@ -195,7 +195,7 @@ def _mueller(problem: InstrumentProblem, k: int, space: Space, fit: Fit) -> Arra
     problem, values = problem.near(space, fit.values)
     data = problem.captures[k]
     changes = problem.changes(k, space, values)
-    w = problem.rows_of(k, changes) * data.row_exposure[:, None]
+    w = data.matrix_of(problem.models[k], changes)
     if rank_of(w) < 16:
         return None
     rows, shape = w.shape[0], data.signal.shape[2:]
