@@ -255,10 +255,7 @@ class Setup:
         if packet_size is None:
             packet_size = min(_DEFAULT_PACKET_BYTES, mtu or _DEFAULT_PACKET_BYTES)
         if mtu is not None and packet_size > mtu:
-            raise self._refused(
-                f"packet_size {packet_size}",
-                f"interface {interface} has an MTU of {mtu}",
-            )
+            raise self._refused(f"packet_size {packet_size}", f"interface {interface} has an MTU of {mtu}")
         with self._features.asking(f"set packet size to {packet_size}"):
             self._camera.gv_set_packet_size_adjustment(self._aravis.GvPacketSizeAdjustment.NEVER)
             self._camera.gv_set_packet_size(packet_size)

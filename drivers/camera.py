@@ -311,9 +311,7 @@ class Camera(ABC):
                 mean.add(frame)
             return frame
         raise FrameLost(
-            loss.asked,
-            f"{loss.came_back}; {self._allowed_retakes + 1} tries in a row failed",
-            loss.what_to_do,
+            loss.asked, f"{loss.came_back}; {self._allowed_retakes + 1} tries in a row failed", loss.what_to_do
         ) from loss
 
     # --- state -------------------------------------------------------------------------------------------

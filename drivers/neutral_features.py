@@ -117,9 +117,7 @@ RULES = (
     Rule(r"VendorDefectPixelCorr|BsliDPC[EH]|(HotPixel|\w*Defective\w*|FlatField)Correction", "off", False),
     # A factor for each pixel or colour, the same for every frame.
     Rule(
-        r"\w*(FFC|FlatField|FlatFieldCorrection|Shading|LensShading|Vignetting)(Correction)?(Mode|Enable)",
-        "off",
-        False,
+        r"\w*(FFC|FlatField|FlatFieldCorrection|Shading|LensShading|Vignetting)(Correction)?(Mode|Enable)", "off", False
     ),
     Rule(r"BalanceRatio(Abs)?", "unity", False),
     Rule(r"LightSource(Selector|Preset)", "off", False),

@@ -53,10 +53,7 @@ def open_with_shutter(
     baudrate: int,
 ) -> Source:
     """Open the source, and the shutter where there is one; changes nothing."""
-    with (
-        lines.link(config, baudrate, prompt_framer) as link,
-        contextlib.ExitStack() as cleanup,
-    ):
+    with lines.link(config, baudrate, prompt_framer) as link, contextlib.ExitStack() as cleanup:
         shutter: LightSource | None = None
         if config.shutter is not None:
             shutter = sc10.open(config.shutter, lines)

@@ -82,13 +82,7 @@ class Campaign(FiniteSection):
     omega_deg: AngleSteps | Annotated[tuple[Angle, ...], Field(min_length=1)] = Field(
         description="angles between source and camera: a list, or equal steps; taken upwards"
     )
-    exposure_s: (
-        Annotated[
-            Seconds | ByWavelength | Auto,
-            Discriminator(exposure_kind),
-        ]
-        | None
-    ) = Field(
+    exposure_s: Annotated[Seconds | ByWavelength | Auto, Discriminator(exposure_kind)] | None = Field(
         default=None, description="seconds, or seconds for each wavelength, or {kind: auto}; without it the plan's"
     )
     references: tuple[Reference, ...] = Field(
@@ -170,10 +164,7 @@ def captures(campaign: Campaign) -> Iterator[CampaignCapture]:
                         if due and mode in reference.modes:
                             number += 1
                             reference_plan = plan.with_changes(
-                                **common,
-                                sample=reference.sample,
-                                omega_deg=reference.omega_deg,
-                                role=reference.role,
+                                **common, sample=reference.sample, omega_deg=reference.omega_deg, role=reference.role
                             )
                             yield _capture(number, reference_plan, True)
                     number += 1

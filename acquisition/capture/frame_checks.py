@@ -83,14 +83,7 @@ class FrameChecks:
             )
 
     def report(
-        self,
-        state: int,
-        role: str,
-        positions: dict[str, Position],
-        exposure_s: float,
-        *,
-        frame: Frame,
-        full_scale: int,
+        self, state: int, role: str, positions: dict[str, Position], exposure_s: float, *, frame: Frame, full_scale: int
     ) -> StateReport:
         """Statistics of a frame; `full_scale` is the largest count that a pixel can have."""
         pixels, dim = frame.pixels, self._black + NEAR_BLACK * (full_scale - self._black)

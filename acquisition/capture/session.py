@@ -37,13 +37,7 @@ DARKER_TRIES = 3
 
 
 def take(
-    job: Job,
-    rig: Rig,
-    path: Path,
-    stop: StopRequest,
-    *,
-    observers: Sequence[Observer] = (),
-    home: bool = False,
+    job: Job, rig: Rig, path: Path, stop: StopRequest, *, observers: Sequence[Observer] = (), home: bool = False
 ) -> Result:
     """Take a new capture into `path`; the rig is open and `check_with_devices` has passed.
 

@@ -15,12 +15,7 @@ from processing.whole_file import write_new_text
 from processing.yaml_file import parse_yaml
 
 #: Kinds with these USB numbers (vendor, product); a plain FTDI chip (0403:6001) may be anything.
-LIKELY = {
-    (0x0403, 0xFAF0): "apt",
-    (0x0403, 0x6015): "elliptec",
-    (0x1CBE, 0x0007): "standa",
-    (0x1313, 0x80C8): "dc2200",
-}
+LIKELY = {(0x0403, 0xFAF0): "apt", (0x0403, 0x6015): "elliptec", (0x1CBE, 0x0007): "standa", (0x1313, 0x80C8): "dc2200"}
 BY_ID = Path("/dev/serial/by-id")
 
 

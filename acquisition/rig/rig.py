@@ -72,13 +72,7 @@ class Rig(JointAxes):
     (True, False, None)
     """
 
-    def __init__(
-        self,
-        config: RigConfig,
-        *,
-        with_camera: bool = True,
-        ask: Ask | None = None,
-    ) -> None:
+    def __init__(self, config: RigConfig, *, with_camera: bool = True, ask: Ask | None = None) -> None:
         super().__init__(config, clock_of(config))
         self.camera: Camera | None = None
         self.last_frame: NDArray[np.uint16] | None = None

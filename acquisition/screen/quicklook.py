@@ -58,9 +58,7 @@ def draw(path: Path) -> Path:
     return target
 
 
-def _maps(
-    capture: Capture,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], list[float], list[int]]:
+def _maps(capture: Capture) -> tuple[NDArray[np.float32], NDArray[np.float32], list[float], list[int]]:
     light = _best_exposure(capture)
     mosaic = capture.header.mosaic is not None
     step = max(1, -(-max(capture.frame_shape) // LARGEST))

@@ -24,8 +24,7 @@ def design_command(
     states: Annotated[str, typer.Option(help="Number of states; several for --optimize: 24,30,40.")] = "40",
     ratio: Annotated[float, typer.Option(help="Analyzer retarder angle over generator retarder angle.")] = 4.91,
     step: Annotated[
-        float | None,
-        typer.Option(help="Step in degrees; default: one turn, or half of one if its states repeat."),
+        float | None, typer.Option(help="Step in degrees; default: one turn, or half of one if its states repeat.")
     ] = None,
     table: Annotated[
         Path | None, typer.Option(help="CSV of your own states: a column of degrees for each axis.")

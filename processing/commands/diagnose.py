@@ -19,8 +19,7 @@ def diagnose_command(
     *,
     captures: Annotated[list[Path], typer.Argument(help="Captures of one instrument, at one wavelength or several.")],
     instrument: Annotated[
-        Path | None,
-        typer.Option(help="Instrument file to compare with; default: the model in the first capture."),
+        Path | None, typer.Option(help="Instrument file to compare with; default: the model in the first capture.")
     ] = None,
     write: Annotated[
         Path | None, typer.Option(help="New file with the effects found: instrument, or material.")

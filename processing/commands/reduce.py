@@ -59,12 +59,5 @@ def reduce_command(
 
     inputs = files_of(captures, lambda path: not made_of_captures(path), "captures")
     make_products(
-        "reducing",
-        "parts",
-        inputs,
-        step_of,
-        out=out,
-        overwrite=overwrite,
-        figure=figure,
-        no_figure=no_figure,
+        "reducing", "parts", inputs, step_of, out=out, overwrite=overwrite, figure=figure, no_figure=no_figure
     )

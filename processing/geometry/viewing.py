@@ -52,11 +52,7 @@ class ViewingGeometry(Section):
         return self.source_distance_mm * np.array([np.sin(w), 0.0, np.cos(w)])
 
     def at(
-        self,
-        omega_deg: float,
-        rows: int | None = None,
-        columns: int | None = None,
-        block: slice = slice(None),
+        self, omega_deg: float, rows: int | None = None, columns: int | None = None, block: slice = slice(None)
     ) -> GeometryImage:
         """Geometry of each pixel that sees a lit point.
 

@@ -43,11 +43,7 @@ class StateTable:
 
     def __post_init__(self) -> None:
         n = len(self.role)
-        for name, column in {
-            **self.angles_deg,
-            "exposure_s": self.exposure_s,
-            "repeats": self.repeats,
-        }.items():
+        for name, column in {**self.angles_deg, "exposure_s": self.exposure_s, "repeats": self.repeats}.items():
             if np.shape(column) != (n,):
                 raise ValueError(f"state table: column {name!r} has shape {np.shape(column)}, expected ({n},)")
             if not np.all(np.isfinite(column)):

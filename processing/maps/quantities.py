@@ -157,9 +157,7 @@ def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
             lambda writer: partial_facts(writer, partial) | inputs,
         )
     return _Maps(
-        with_errors(maps, systematic=bool(inputs)) | NOISE,
-        block,
-        lambda writer: _facts(writer, maps) | inputs,
+        with_errors(maps, systematic=bool(inputs)) | NOISE, block, lambda writer: _facts(writer, maps) | inputs
     )
 
 

@@ -86,22 +86,9 @@ def square_tile(a, count, b):  # type: ignore[no-untyped-def]
     """b = A A, in the same 16 rows."""
     for j in range(count):
         d0, d1, d2, d3 = a[j], a[1 * T + j], a[2 * T + j], a[3 * T + j]
-        r01, i01, r02, i02, r03, i03 = (
-            a[4 * T + j],
-            a[5 * T + j],
-            a[6 * T + j],
-            a[7 * T + j],
-            a[8 * T + j],
-            a[9 * T + j],
-        )
-        r12, i12, r13, i13, r23, i23 = (
-            a[10 * T + j],
-            a[11 * T + j],
-            a[12 * T + j],
-            a[13 * T + j],
-            a[14 * T + j],
-            a[15 * T + j],
-        )
+        r01, i01, r02, i02 = a[4 * T + j], a[5 * T + j], a[6 * T + j], a[7 * T + j]
+        r03, i03, r12, i12 = a[8 * T + j], a[9 * T + j], a[10 * T + j], a[11 * T + j]
+        r13, i13, r23, i23 = a[12 * T + j], a[13 * T + j], a[14 * T + j], a[15 * T + j]
         n01, n02, n03 = r01 * r01 + i01 * i01, r02 * r02 + i02 * i02, r03 * r03 + i03 * i03
         n12, n13, n23 = r12 * r12 + i12 * i12, r13 * r13 + i13 * i13, r23 * r23 + i23 * i23
         b[j], b[1 * T + j] = d0 * d0 + n01 + n02 + n03, d1 * d1 + n01 + n12 + n13
@@ -165,22 +152,9 @@ def dominant_tile(a, b, x, count, c, out, start):  # type: ignore[no-untyped-def
         v = x[j]
         w = v * v - 0.5
         d0, d1, d2, d3 = a[j], a[1 * T + j], a[2 * T + j], a[3 * T + j]
-        r01, i01, r02, i02, r03, i03 = (
-            a[4 * T + j],
-            a[5 * T + j],
-            a[6 * T + j],
-            a[7 * T + j],
-            a[8 * T + j],
-            a[9 * T + j],
-        )
-        r12, i12, r13, i13, r23, i23 = (
-            a[10 * T + j],
-            a[11 * T + j],
-            a[12 * T + j],
-            a[13 * T + j],
-            a[14 * T + j],
-            a[15 * T + j],
-        )
+        r01, i01, r02, i02 = a[4 * T + j], a[5 * T + j], a[6 * T + j], a[7 * T + j]
+        r03, i03, r12, i12 = a[8 * T + j], a[9 * T + j], a[10 * T + j], a[11 * T + j]
+        r13, i13, r23, i23 = a[12 * T + j], a[13 * T + j], a[14 * T + j], a[15 * T + j]
         c0, c1 = b[j] + v * d0 + w, b[1 * T + j] + v * d1 + w
         c2, c3 = b[2 * T + j] + v * d2 + w, b[3 * T + j] + v * d3 + w
         s01, t01 = b[4 * T + j] + v * r01, b[5 * T + j] + v * i01

@@ -182,16 +182,7 @@ class _Sums:
         with np.errstate(divide="ignore", invalid="ignore"):
             correlation = (cov[0] + cov[1]) / (alpha_0_stderr * m00_stderr)
         return Xi0Estimate(
-            xi0,
-            xi0_stderr,
-            total,
-            m00_stderr,
-            condition,
-            valid,
-            unphysical,
-            chi_square,
-            alpha_0_stderr,
-            correlation,
+            xi0, xi0_stderr, total, m00_stderr, condition, valid, unphysical, chi_square, alpha_0_stderr, correlation
         )
 
 

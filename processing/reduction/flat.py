@@ -109,12 +109,7 @@ class FlatCapture:
             return None
         header = capture.header
         return cls(
-            capture.path,
-            capture.simulated,
-            header.mosaic,
-            header.wavelength_nm,
-            capture.frame_shape,
-            _time_s(capture),
+            capture.path, capture.simulated, header.mosaic, header.wavelength_nm, capture.frame_shape, _time_s(capture)
         )
 
 

@@ -51,13 +51,7 @@ def add_sums(
 
 
 def _accumulate_at_once(
-    rows: NDArray[np.int32],
-    values: Array,
-    total: Array,
-    square: Array,
-    count: NDArray[np.int64],
-    start: int,
-    stop: int,
+    rows: NDArray[np.int32], values: Array, total: Array, square: Array, count: NDArray[np.int64], start: int, stop: int
 ) -> None:
     index = np.flatnonzero(rows >= 0)
     row = rows[index]

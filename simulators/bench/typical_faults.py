@@ -111,11 +111,7 @@ FAULTS: Mapping[str, TypicalFault] = {
     "generator_ellipticity": TypicalFault(1, 6, "degrees of retardance", _window("psg_polarizer", 45.0)),
     "path_retardance": TypicalFault(1, 6, "degrees of retardance", _window("psg_retarder")),
     "retarder_diattenuation": TypicalFault(
-        0.004,
-        0.03,
-        "of the light",
-        lambda d: _element(_PLATES[d.axis], "diattenuation")(d),
-        signed=True,
+        0.004, 0.03, "of the light", lambda d: _element(_PLATES[d.axis], "diattenuation")(d), signed=True
     ),
     "retarder_transmission": TypicalFault(
         0.005,
@@ -163,12 +159,7 @@ FAULTS: Mapping[str, TypicalFault] = {
         signed=True,
         slow=True,
     ),
-    "stray_light": TypicalFault(
-        1000,
-        8000,
-        "electrons a second",
-        lambda d: {"kind": "stray_light", "e_per_s": d.size},
-    ),
+    "stray_light": TypicalFault(1000, 8000, "electrons a second", lambda d: {"kind": "stray_light", "e_per_s": d.size}),
     "rotation_eccentricity": TypicalFault(
         0.1,
         1,
@@ -182,11 +173,7 @@ FAULTS: Mapping[str, TypicalFault] = {
         },
     ),
     "rotation_ratio": TypicalFault(
-        2e-4,
-        2e-3,
-        "relative",
-        lambda d: {"kind": "angle_scale", "axis": d.axis, "scale_error": d.size},
-        signed=True,
+        2e-4, 2e-3, "relative", lambda d: {"kind": "angle_scale", "axis": d.axis, "scale_error": d.size}, signed=True
     ),
     "rotation_slip": TypicalFault(
         0.2,
@@ -216,24 +203,12 @@ FAULTS: Mapping[str, TypicalFault] = {
         signed=True,
     ),
     "source_flicker": TypicalFault(
-        0.003,
-        0.02,
-        "of the light, standard deviation",
-        lambda d: {"kind": "source_flicker", "sigma": d.size},
+        0.003, 0.02, "of the light, standard deviation", lambda d: {"kind": "source_flicker", "sigma": d.size}
     ),
     "detector_nonlinearity": TypicalFault(
-        0.01,
-        0.06,
-        "lost at full scale",
-        lambda d: {"kind": "nonlinearity", "at_full_scale": d.size},
-        signed=True,
+        0.01, 0.06, "lost at full scale", lambda d: {"kind": "nonlinearity", "at_full_scale": d.size}, signed=True
     ),
-    "tone_curve": TypicalFault(
-        0.02,
-        0.1,
-        "gamma - 1",
-        lambda d: {"kind": "tone_curve", "gamma": 1 + d.size},
-    ),
+    "tone_curve": TypicalFault(0.02, 0.1, "gamma - 1", lambda d: {"kind": "tone_curve", "gamma": 1 + d.size}),
     "detector_offset": TypicalFault(
         20,
         200,
@@ -259,10 +234,7 @@ FAULTS: Mapping[str, TypicalFault] = {
         },
     ),
     "beam_wander": TypicalFault(
-        0.15,
-        0.8,
-        "pixels",
-        lambda d: {"kind": "image_drift", "axis": d.axis, "wedge_pixels": d.size},
+        0.15, 0.8, "pixels", lambda d: {"kind": "image_drift", "axis": d.axis, "wedge_pixels": d.size}
     ),
     "channel_gain": TypicalFault(
         1.005,
@@ -276,10 +248,6 @@ FAULTS: Mapping[str, TypicalFault] = {
         0.002, 0.02, "of the light", _element("micropolarizer_45", "extinction"), mode="stokes"
     ),
     "pixel_crosstalk": TypicalFault(
-        0.002,
-        0.02,
-        "of the light",
-        lambda d: {"kind": "mosaic_crosstalk", "fraction": d.size},
-        mode="stokes",
+        0.002, 0.02, "of the light", lambda d: {"kind": "mosaic_crosstalk", "fraction": d.size}, mode="stokes"
     ),
 }

@@ -4,15 +4,7 @@ import time
 
 import pytest
 
-from drivers.errors import (
-    DeviceError,
-    MotionFailed,
-    NotHomedError,
-    PortNotFound,
-    ReplyError,
-    ReplyTimeout,
-    WrongDevice,
-)
+from drivers.errors import DeviceError, MotionFailed, NotHomedError, PortNotFound, ReplyError, ReplyTimeout, WrongDevice
 from simulators.clock import patient_clock
 from simulators.conformance.served_axes import AxisTests
 from simulators.serial.reply_faults import Fault

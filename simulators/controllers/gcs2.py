@@ -46,18 +46,7 @@ class GCS2Emulator(Emulator):
 
     # The answer for another axis; a number without an axis is all that other questions get.
     foreign = b"9=77.0000\n"
-    pieces = (
-        b"MOV 1 ",
-        b"FRF",
-        b"SVO 1 1\n",
-        b"POS?\n",
-        b"HLT 2",
-        b"VEL 1 ",
-        b"\x05",
-        b"\x18",
-        b"ERR?\n",
-        b"\n",
-    )
+    pieces = (b"MOV 1 ", b"FRF", b"SVO 1 1\n", b"POS?\n", b"HLT 2", b"VEL 1 ", b"\x05", b"\x18", b"ERR?\n", b"\n")
 
     def __init__(self, stages: Sequence[Stage], clock: FastClock, faults: FaultSchedule | None = None) -> None:
         super().__init__([stage.axis for stage in stages], clock, faults)

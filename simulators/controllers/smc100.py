@@ -249,20 +249,7 @@ def _number(value: str) -> float:
 class SMC100Emulator(Emulator):
     """Controllers on one line; `true_deg(i)` belongs to the i-th controller."""
 
-    pieces = (
-        b"\r\n1TS\r\n",
-        b"1PA",
-        b"1OR",
-        b"1TS",
-        b"1RS",
-        b"1MM0",
-        b"1VA",
-        b"1SL-",
-        b"ST",
-        b"1PW1",
-        b"\r\n",
-        b"?",
-    )
+    pieces = (b"\r\n1TS\r\n", b"1PA", b"1OR", b"1TS", b"1RS", b"1MM0", b"1VA", b"1SL-", b"ST", b"1PW1", b"\r\n", b"?")
 
     def __init__(
         self, controllers: Sequence[SMC100Controller], clock: FastClock, faults: FaultSchedule | None = None

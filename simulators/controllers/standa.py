@@ -51,18 +51,7 @@ class StandaEmulator(Emulator):
         Motions are taken and not carried out, until `stop`.
     """
 
-    pieces = (
-        b"move",
-        b"movr\x00\x01",
-        b"home",
-        b"sstp",
-        b"gets",
-        b"geng",
-        b"smov",
-        bytes(24),
-        b"zero",
-        b"gser",
-    )
+    pieces = (b"move", b"movr\x00\x01", b"home", b"sstp", b"gets", b"geng", b"smov", bytes(24), b"zero", b"gser")
 
     def __init__(self, axis: EmulatedAxis, clock: FastClock, faults: FaultSchedule | None = None) -> None:
         super().__init__([axis], clock, faults)

@@ -51,10 +51,7 @@ class PtyPort(ServedPort):
                 pending = (pending + self.emulator.take_output())[-65536:]
                 wait_s = self.emulator.next_output_s()
                 readable, _, _ = select.select(
-                    [self._master, self._wake_read],
-                    [],
-                    [],
-                    BEAT_S if wait_s is None else max(0.0, min(wait_s, BEAT_S)),
+                    [self._master, self._wake_read], [], [], BEAT_S if wait_s is None else max(0.0, min(wait_s, BEAT_S))
                 )
                 if self._wake_read in readable:
                     return

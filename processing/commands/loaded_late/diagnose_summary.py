@@ -5,14 +5,7 @@ from pathlib import Path
 
 import typer
 
-from processing.diagnosis.search.result import (
-    CaptureReport,
-    Combination,
-    Diagnosis,
-    FoundEffect,
-    Ranked,
-    Unexplained,
-)
+from processing.diagnosis.search.result import CaptureReport, Combination, Diagnosis, FoundEffect, Ranked, Unexplained
 from processing.whole_file import write_new_text
 
 VERDICTS = {

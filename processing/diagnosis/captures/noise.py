@@ -17,15 +17,7 @@ from processing.diagnosis.captures.black_jitter import black_jitter
 from processing.diagnosis.captures.capture_data import CaptureData, SharedNoise, mixed_part
 from processing.diagnosis.captures.outliers import Whitened
 from processing.diagnosis.search.range_of import NEARLY_ZERO
-from processing.diagnosis.search.rules import (
-    DARK_NOISE_OFF,
-    LEAST_PART,
-    LITTLE,
-    NOISE_OFF,
-    NOISE_SURE,
-    SHOWN,
-    SMALL,
-)
+from processing.diagnosis.search.rules import DARK_NOISE_OFF, LEAST_PART, LITTLE, NOISE_OFF, NOISE_SURE, SHOWN, SMALL
 from processing.storage.captures.capture import CaptureError
 
 #: [pixels] Along a side of an image, below which it tells nothing about noise.

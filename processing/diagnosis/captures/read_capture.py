@@ -19,13 +19,7 @@ from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.captures.dark_noise import without_noise_of_darks
 from processing.diagnosis.captures.rounding import Planes, Rounding
 from processing.diagnosis.captures.unstated_noise import estimated_noise
-from processing.diagnosis.search.rules import (
-    FEWEST_PIXELS,
-    LIMIT,
-    LITTLE,
-    NOISE_SURE,
-    OUTSTANDING,
-)
+from processing.diagnosis.search.rules import FEWEST_PIXELS, LIMIT, LITTLE, NOISE_SURE, OUTSTANDING
 from processing.instrument.changes import Conditions, elapsed, elapsed_error
 from processing.instrument.model import InstrumentModel
 from processing.reduction.capture_evidence import evidence_of

@@ -52,15 +52,7 @@ def bilinear_stokes(
 
 
 def _rows_at_once(
-    frame: NDArray[Any],
-    m: Image,
-    s0: Image,
-    s1: Image,
-    s2: Image,
-    dolp: Image,
-    aolp: Image,
-    first: int,
-    last: int,
+    frame: NDArray[Any], m: Image, s0: Image, s1: Image, s2: Image, dolp: Image, aolp: Image, first: int, last: int
 ) -> None:
     wide = np.pad(frame.astype(np.float32), 1, mode="reflect")[first : last + 2]
     planes = []
