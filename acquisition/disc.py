@@ -117,10 +117,7 @@ class DiscProcess:
     def call(self, task: str, function: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
         """Call a function in the disc process and return its value.
 
-        Raises
-        ------
-        AcquisitionError
-            The disc has not answered for DISC_S; the call ends when it answers.
+        Raises AcquisitionError: the disc has not answered for DISC_S; the call ends when it answers.
         """
         future = self.submit(partial(function, **options), *arguments)
         while not wait([future], SLICE_S).done:

@@ -50,10 +50,8 @@ class ChunkStamps:
     def time_ns(self, arrival: Arrival) -> int:
         """The camera's time of an exposure in nanoseconds: of the chunk, or of the transfer where none is asked for.
 
-        Raises
-        ------
-        FrameLost
-            The chunk did not come. The time of the transfer is another instant than that of the other frames.
+        Raises FrameLost: the chunk did not come. The time of the transfer is another instant than that of the other
+        frames.
         """
         if self._parser is None:
             return arrival.camera_time_ns

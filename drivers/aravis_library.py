@@ -22,10 +22,7 @@ _FREES_ITSELF_S = 5.0
 def load_aravis() -> tuple[Any, Any]:
     """Import Aravis and return its module and GLib's exception class.
 
-    Raises
-    ------
-    CameraError
-        `gi` or the Aravis typelib is not installed.
+    Raises CameraError: `gi` or the Aravis typelib is not installed.
     """
     try:
         import gi

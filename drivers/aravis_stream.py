@@ -150,10 +150,7 @@ def counts_of(
 ) -> NDArray[np.uint16]:
     """Counts (rows, columns) of a whole frame, right-aligned, in memory of their own, read-only.
 
-    Raises
-    ------
-    UnknownPixelFormat
-        The counts contradict `bits` and `shift` of the rig file.
+    Raises UnknownPixelFormat: the counts contradict `bits` and `shift` of the rig file.
     """
     pixels = fmt.decode(arrival.memory, *size, shift=shift)
     if misalignment := fmt.misalignment(arrival.memory, pixels, bits, shift):

@@ -116,12 +116,7 @@ class Exposure:
     def wait_exposed(self) -> None:
         """Wait until the light for this exposure has been collected; the bench may move from then on.
 
-        The frame may still be on its way.
-
-        Raises
-        ------
-        CameraLost
-            The camera stopped answering.
+        The frame may still be on its way. Raises CameraLost: the camera stopped answering.
         """
         if not self._exposed:
             self._camera._do_wait_exposed()

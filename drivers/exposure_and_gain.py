@@ -94,10 +94,7 @@ class ExposureAndGain:
     def set_exposure(self, exposure_s: float, *, stopped: bool) -> None:
         """Set the exposure; the frame rate is lowered where it is limited by it, while the acquisition is stopped.
 
-        Raises
-        ------
-        SettingRefused
-            No such feature, out of its limits at the lowest frame rate, or read back different.
+        Raises SettingRefused: no such feature, out of its limits at the lowest frame rate, or read back different.
         """
         features = self._features
         name = features.find(genicam.EXPOSURE_US)
@@ -191,10 +188,7 @@ class ExposureAndGain:
     def set_gain(self, gain_db: float) -> None:
         """Set the gain.
 
-        Raises
-        ------
-        SettingRefused
-            No such feature, its unit is not known, out of its limits, or read back different.
+        Raises SettingRefused: no such feature, its unit is not known, out of its limits, or read back different.
         """
         features = self._features
         name = features.find(genicam.GAIN_DB)

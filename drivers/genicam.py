@@ -146,10 +146,7 @@ class Features:
     def set_choice(self, name: str, value: str) -> None:
         """Choose one entry of an enumeration and read it back.
 
-        Raises
-        ------
-        SettingRefused
-            The camera has no such entry or reads back another.
+        Raises SettingRefused: the camera has no such entry or reads back another.
         """
         with self.asking(f"set {name} to {value}"):
             entries = list(self._camera.dup_available_enumerations_as_strings(name))
@@ -170,13 +167,7 @@ class Features:
         self.set_flag(name, False)
 
     def set_flag(self, name: str, on: bool) -> None:
-        """Switch a yes-or-no feature and read it back.
-
-        Raises
-        ------
-        SettingRefused
-            It stays as it was.
-        """
+        """Switch a yes-or-no feature and read it back. Raises SettingRefused: it stays as it was."""
         wanted = "on" if on else "off"
         with self.asking(f"switch {name} {wanted}"):
             if bool(self._camera.get_boolean(name)) == on:
@@ -188,11 +179,8 @@ class Features:
     def set_value(self, name: str, value: bool | int | float | str) -> None:
         """Set any feature to a value of its own kind and read it back.
 
-        Raises
-        ------
-        SettingRefused
-            No such feature, a command, one that can only be read, a value of another kind, out of its limits, or read
-            back different.
+        Raises SettingRefused: no such feature, a command, one that can only be read, a value of another kind, out of
+        its limits, or read back different.
         """
         asked = f"set {name} to {value}"
         if self.find((name,)) is None:

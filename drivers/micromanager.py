@@ -18,10 +18,7 @@ NOT_TOLD = "not told by the core"
 def running_core(request: str, configuration: Path | None, device: str) -> Any:
     """Return the core of this process; loads the configuration if it has no device of that name yet.
 
-    Raises
-    ------
-    DeviceError
-        pymmcore-plus is not installed, or the configuration cannot be loaded.
+    Raises DeviceError: pymmcore-plus is not installed, or the configuration cannot be loaded.
     """
     try:
         from pymmcore_plus import CMMCorePlus

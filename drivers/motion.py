@@ -63,13 +63,7 @@ class Motion:
         self._idle_since_s: float | None = None
 
     def done(self) -> bool:
-        """Look once: True if the motion has ended at its target.
-
-        Raises
-        ------
-        MotionFailed
-            As `wait`.
-        """
+        """Look once: True if the motion has ended at its target. Raises MotionFailed: as `wait`."""
         if self._result is not None:
             return True
         if self._failure is not None:
@@ -87,11 +81,8 @@ class Motion:
     def wait(self) -> Position:
         """Wait until the axis is idle and return the position read back after that.
 
-        Raises
-        ------
-        MotionFailed
-            Stall, silence, a fault of the controller, an end position off the target, or the deadline. The axis
-            has been sent a stop by then. `MotionStopped` if `stop()` ended it.
+        Raises MotionFailed: stall, silence, a fault of the controller, an end position off the target, or the deadline.
+        The axis has been sent a stop by then. `MotionStopped` if `stop()` ended it.
         """
         while not self.done():
             self.axis.clock.sleep_s(self.axis.config.poll_s)

@@ -191,10 +191,7 @@ class NeutralFeatures:
     def establish(self) -> None:
         """Load the default once, and set every feature that a rule knows.
 
-        Raises
-        ------
-        CameraLost
-            The camera stopped answering.
+        Raises CameraLost: the camera stopped answering.
         """
         if self._rules is None:
             names = self._features.names()
@@ -213,10 +210,7 @@ class NeutralFeatures:
     def require(self) -> None:
         """Read every feature once more, after all settings are made.
 
-        Raises
-        ------
-        SettingRefused
-            One that spoils the frames is not neutral.
+        Raises SettingRefused: one that spoils the frames is not neutral.
         """
         issues = list(self._not_neutral())
         if issues:

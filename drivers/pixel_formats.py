@@ -120,10 +120,7 @@ class PixelFormat:
     def encode(self, pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
         """Lay out an image as a camera would send it: the inverse of `decode` with no shift.
 
-        Raises
-        ------
-        ValueError
-            A value needs more than `bits` bits.
+        Raises ValueError: a value needs more than `bits` bits.
         """
         if self.angles:
             pixels = np.stack([pixels[r::2, c::2] for r, c in _SUPER_PIXEL], axis=-1)
@@ -284,10 +281,8 @@ _BY_NAME = {fmt.name: fmt for fmt in PIXEL_FORMATS}
 def pixel_format_of(code: int, name: str) -> PixelFormat:
     """The format that a camera is set to, by the code and the name that it tells; the code decides.
 
-    Raises
-    ------
-    UnknownPixelFormat
-        As `pixel_format`; also where the name is known, but the code says another size of a pixel.
+    Raises UnknownPixelFormat: as `pixel_format`; also where the name is known, but the code says another size of a
+    pixel.
     """
     code &= 0xFFFFFFFF
     entry = _BY_NAME.get(name)
@@ -299,11 +294,8 @@ def pixel_format_of(code: int, name: str) -> PixelFormat:
 def pixel_format(name_or_code: str | int) -> PixelFormat:
     """Look up a format by the camera's name or by its code.
 
-    Raises
-    ------
-    UnknownPixelFormat
-        Not in `PIXEL_FORMATS`, including the processed outputs (angle and degree of polarization, Stokes, full
-        colour) of cameras, which are not raw intensities.
+    Raises UnknownPixelFormat: not in `PIXEL_FORMATS`, including the processed outputs (angle and degree of
+    polarization, Stokes, full colour) of cameras, which are not raw intensities.
     """
     code = name_or_code & 0xFFFFFFFF if isinstance(name_or_code, int) else None
     known_format = _BY_NAME.get(str(name_or_code)) if code is None else _BY_CODE.get(code)

@@ -29,9 +29,7 @@ class PromptLine:
     def ask(self, query: str, form: re.Pattern[str] | None = None) -> str:
         """One query; after an unusable reply, also one of another form, it is repeated once after a pause.
 
-        Raises
-        ------
-        CommandRejected, ReplyError, ReplyTimeout
+        Raises CommandRejected, ReplyError, ReplyTimeout.
         """
         try:
             return self._exchange(query, self._reply_s, form)

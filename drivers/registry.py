@@ -26,10 +26,7 @@ Family = Literal["axes", "cameras", "sources"]
 def device_kinds(family: Family) -> dict[str, ModuleType]:
     """Return every kind of a family with its module, in alphabetical order.
 
-    Raises
-    ------
-    ValueError
-        A plug-in offers a kind that exists already, or a module that is none.
+    Raises ValueError: a plug-in offers a kind that exists already, or a module that is none.
     """
     folder = importlib.import_module(f"drivers.{family}")
     kinds = {

@@ -202,10 +202,7 @@ T = TypeVar("T")
 def agreed(read: Callable[[], T]) -> T:
     """Read a constant until two readings in a row are equal.
 
-    Raises
-    ------
-    ReplyError
-        Four readings and no two in a row equal.
+    Raises ReplyError: four readings and no two in a row equal.
     """
     readings = [read()]
     while len(readings) < 4:

@@ -79,9 +79,7 @@ def open_port(
 ) -> Any:
     """Open a port or an address as pyserial knows them; the port alone, and for this program alone.
 
-    Raises
-    ------
-    PortNotFound, PortBusy, PermissionRefused
+    Raises PortNotFound, PortBusy, PermissionRefused.
     """
     action = f"open port {port}"
     if port.startswith(HELD):

@@ -31,9 +31,7 @@ class TextLine(ControllerLine):
     def ask(self, command: str, form: re.Pattern[str]) -> str:
         """Ask a question and return the reply of the given form; once more if none came.
 
-        Raises
-        ------
-        ReplyTimeout, ReplyError
+        Raises ReplyTimeout, ReplyError.
         """
         request = f"{self.controller} {self.link.port}, {command if command >= ' ' else repr(command)}"
         question, check = self._bytes(command), self.what_to_check

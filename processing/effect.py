@@ -100,9 +100,7 @@ E = TypeVar("E", bound=Effect)
 def load_effects(package: str, family: type[E], group: str) -> dict[str, E]:
     """Effects by kind: one concrete class in each module of a package, then plug-ins of an entry point group.
 
-    Raises
-    ------
-    EffectError : a module defines no effect of the family, or more than one; a plug-in offers one that exists.
+    Raises EffectError: a module defines no effect of the family, or more than one; a plug-in offers one that exists.
     """
     effects: dict[str, E] = {}
     for info in sorted(pkgutil.iter_modules(importlib.import_module(package).__path__), key=lambda i: i.name):

@@ -66,10 +66,7 @@ def _take_free_name(beside: Path, path: Path) -> None:
 def open_plain(path: Path, flags: int) -> int:
     """Open a file of one's own for writing, made if it is not there.
 
-    Raises
-    ------
-    OSError
-        Somebody has put a link, a pipe or a device there, or a second name of another file.
+    Raises OSError: somebody has put a link, a pipe or a device there, or a second name of another file.
     """
     # Windows has neither such links nor such pipes, but would translate the ends of lines.
     for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"):

@@ -40,10 +40,7 @@ class ConfigError(ProcessError):
 def load_yaml(path: Path | str, model: type[Model]) -> Model:
     """Read `path` and validate it as `model`.
 
-    Raises
-    ------
-    ConfigError
-        The file is missing, is not YAML, repeats a key, or does not fit the model.
+    Raises ConfigError: the file is missing, is not YAML, repeats a key, or does not fit the model.
     """
     path = Path(path)
     return parse_yaml(read_text(path, ConfigError, MOST_BYTES), model, source=str(path))

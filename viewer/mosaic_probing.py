@@ -45,11 +45,8 @@ class SuperPixelReducer:
     def curve(self, region: Region) -> dict[str, Any]:
         """Signal of each analyzer in each state with the fitted one, residuals in units of noise, and Stokes values.
 
-        The region is widened to whole super-pixels, whose pixels of one analyzer are averaged.
-
-        Raises
-        ------
-        ProcessError : it is too large.
+        The region is widened to whole super-pixels, whose pixels of one analyzer are averaged. Raises ProcessError: it
+        is too large.
         """
         block, signal = self._signal(region)
         pixels = block.pixels // len(self._layout.channels)

@@ -32,9 +32,7 @@ class Window:
     def parse(cls, query: Any, shape: tuple[int, int], most: int = MOST) -> "Window":
         """The part that a request asks for with x0, x1, y0, y1 and most; default: all of it.
 
-        Raises
-        ------
-        ProcessError : they are no numbers.
+        Raises ProcessError: they are no numbers.
         """
         try:
             y0, y1 = (float(query.get(name, default)) for name, default in (("y0", 0), ("y1", shape[0])))

@@ -103,11 +103,8 @@ class PixelReducer:
     def image(self, region: Region) -> tuple[MuellerImage, NDArray[np.float64]]:
         """A region of the frame as an image of one pixel, and its intensities (N,) in counts.
 
-        It is the mean of those pixels that can be used; super-pixels count that the region touches.
-
-        Raises
-        ------
-        ProcessError : none of its pixels can be used, or it is too large.
+        It is the mean of those pixels that can be used; super-pixels count that the region touches. Raises
+        ProcessError: none of its pixels can be used, or it is too large.
         """
         region = region.reduced(self._cell)
         if region.pixels * self.reduction.w.size // 16 > MOST:
@@ -134,9 +131,7 @@ def analyzer_names(channels: Sequence[str]) -> list[str]:
 def curve(reducer: PixelReducer, region: Region) -> dict[str, Any]:
     """Signal of each sample state and channel with the fitted one, and the residual in units of the noise.
 
-    Raises
-    ------
-    ProcessError : see `PixelReducer.image`.
+    Raises ProcessError: see `PixelReducer.image`.
     """
     image, intensities = reducer.image(region)
     channels = len(reducer.channels)

@@ -126,10 +126,7 @@ class CaptureDevice(BlueskyDevice):
     def configure(self, values: dict[str, Any]) -> tuple[Readings, Readings]:
         """Change values of the plan, such as `wavelength_nm`; returns the configuration before and after.
 
-        Raises
-        ------
-        PlanRefused, ValidationError
-            The rig cannot do it, or the plan has no such value.
+        Raises PlanRefused, ValidationError: the rig cannot do it, or the plan has no such value.
         """
         before = self.read_configuration()
         with self.turn:

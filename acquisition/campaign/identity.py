@@ -54,10 +54,7 @@ def with_devices(identity: dict[str, Any], rig: Rig) -> dict[str, Any]:
 def require_same_campaign(folder: Path, now: dict[str, Any]) -> None:
     """Refuse to continue a campaign that was begun with another set-up.
 
-    Raises
-    ------
-    Differs
-        With every difference in words, each once.
+    Raises Differs with every difference in words, each once.
     """
     then = read_identity(folder)
     if then is None:
@@ -96,10 +93,7 @@ def read_identity(folder: Path) -> dict[str, Any] | None:
 def folder_for(base: Path, now: dict[str, Any], as_new: bool) -> Path:
     """The folder to take a campaign into: `base`, or with `as_new` the first of base, base-2, ... that it may go on in.
 
-    Raises
-    ------
-    Differs
-        `base` was begun with something else.
+    Raises Differs: `base` was begun with something else.
     """
     folder, number = base, 1
     while True:

@@ -124,10 +124,7 @@ class CampaignRun:
     def run(self, jobs: Sequence[tuple[CampaignCapture, Job]]) -> bool:
         """True if every capture is complete at the end, False if a stop was asked for.
 
-        Raises
-        ------
-        AcquisitionError, DeviceError
-            A capture failed more often than the campaign allows.
+        Raises AcquisitionError, DeviceError: a capture failed more often than the campaign allows.
         """
         self.folder.log("campaign started", captures=len(jobs), rig=self.config.name, simulated=self.config.simulated)
         try:

@@ -46,10 +46,7 @@ def refuse_failed(checks: Sequence[CheckResult]) -> None:
 def standing_pose_deg(plan: MeasurementPlan, rig: RigConfig) -> dict[str, float]:
     """Angles of the axes that stand still during the capture: the arm and the mode's own pose.
 
-    Raises
-    ------
-    PlanRefused
-        The mode's pose is not given at the plan's wavelength.
+    Raises PlanRefused: the mode's pose is not given at the plan's wavelength.
     """
     pose = {}
     for axis, angle in rig.modes[plan.mode].pose_deg.items():

@@ -56,9 +56,7 @@ class FrameChecks:
     def require_as_reported(self, state: int, frame: Frame, settings: CameraSettings, rig: Rig) -> None:
         """Refuse a frame that came before, or that the camera took with other settings than it was set to.
 
-        Raises
-        ------
-        FrameLost
+        Raises FrameLost.
         """
         request = f"camera, frame of state {state}"
         repetition = self.evidence.repeats(frame.pixels)

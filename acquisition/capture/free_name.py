@@ -16,10 +16,7 @@ from acquisition.errors import AcquisitionError
 def free_name(path: Path) -> Iterator[Path]:
     """The path, or NAME-2.h5, NAME-3.h5 ... if that exists; reserved until the end of the block.
 
-    Raises
-    ------
-    AcquisitionError
-        The folder cannot be written.
+    Raises AcquisitionError: the folder cannot be written.
     """
     try:
         free = on_disc(f"create {path}", _take, path)

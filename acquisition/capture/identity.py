@@ -99,10 +99,7 @@ def digest(tree: Any) -> str:
 def require_same(capture: Capture, plan: MeasurementPlan, config: RigConfig, instrument: InstrumentModel) -> None:
     """Refuse to continue a capture whose files differ from those that it was begun with.
 
-    Raises
-    ------
-    Differs
-        With every difference in words.
+    Raises Differs with every difference in words.
     """
     header, began = capture.header, capture.segments[0].identity
     if began is None:

@@ -65,12 +65,8 @@ def prepare(plan: MeasurementPlan, rig: RigConfig, read: ReadInstrument = Instru
     """Check a plan against a rig file; touches no device.
 
     Where the plan leaves the exposure to be found, the table holds the one that the search starts with. `read` reads
-    the instrument's file; a caller that prepares many plans reads it once.
-
-    Raises
-    ------
-    PlanRefused
-        With everything that is wrong.
+    the instrument's file; a caller that prepares many plans reads it once. Raises PlanRefused with everything that is
+    wrong.
     """
     checks = check_plan(plan, rig)
     refuse_failed(checks)

@@ -10,12 +10,9 @@ _COLOURS = {"R": "red", "G": "green", "B": "blue"}
 def match_mosaic(instrument: InstrumentModel, camera: Camera) -> InstrumentModel:
     """The instrument with its mosaic as the camera's frames have it; the instrument file has that of the sensor.
 
-    Raises
-    ------
-    AcquisitionError
-        The camera mirrors, bins or leaves out pixels, so which analyzer or colour filter a pixel has cannot be known,
-        the frames hold parts of super-pixels, the camera names the analyzers otherwise than the instrument,
-        or sends a mosaic that the instrument has not.
+    Raises AcquisitionError: the camera mirrors, bins or leaves out pixels, so which analyzer or colour filter a pixel
+    has cannot be known, the frames hold parts of super-pixels, the camera names the analyzers otherwise than the
+    instrument, or sends a mosaic that the instrument has not.
     """
     settings, identity = camera.settings, camera.describe()
     if instrument.mosaic is None and identity.polarized:

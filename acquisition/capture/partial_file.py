@@ -108,10 +108,7 @@ def finish(partial: Path) -> Path:
 def seal_whole(partial: Path) -> Path | None:
     """Seal a file whose states are all there, but whose run was killed before its end; None if states are missing.
 
-    Raises
-    ------
-    AcquisitionError
-        Another program has the file open, or it is damaged.
+    Raises AcquisitionError: another program has the file open, or it is damaged.
     """
     with Capture(partial) as capture:
         if len(capture.done) < capture.planned_states:

@@ -157,10 +157,7 @@ class CaptureRunner:
     def go(self, state: int, why: Entry) -> None:
         """Go to the pose of a state, from wherever the axes stand, by an allowed way; `why` is the ledger's entry.
 
-        Raises
-        ------
-        AcquisitionError
-            There is no allowed way.
+        Raises AcquisitionError: there is no allowed way.
         """
         targets = self.poses_deg[state]
         self.tell("moving " + ", ".join(f"{axis} to {angle:g}" for axis, angle in targets.items()))

@@ -41,10 +41,7 @@ def take(
 ) -> Result:
     """Take a new capture into `path`; the rig is open and `check_with_devices` has passed.
 
-    Raises
-    ------
-    AcquisitionError, DeviceError
-        The run failed; the message names the partial file, which `resume` continues.
+    Raises AcquisitionError, DeviceError: the run failed; the message names the partial file, which `resume` continues.
     """
     _require_reference(rig, home)
     place_sample(job, rig)
@@ -68,10 +65,7 @@ def resume(
 ) -> Result:
     """Continue a capture: the first state not done, then the others, as a new segment of it. Raises as `take`.
 
-    Raises
-    ------
-    Differs
-        The capture was begun with other devices or settings.
+    Raises Differs: the capture was begun with other devices or settings.
     """
     _require_reference(rig, home)
     place_sample(job, rig)

@@ -93,10 +93,7 @@ def _run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Ob
 def _rig_of(campaign: Campaign, file: Path) -> Path | None:
     """The rig that a campaign file names; in a folder of captures, only if the user has used it before.
 
-    Raises
-    ------
-    ConfigError
-        It is in a folder of captures, which may belong to another user.
+    Raises ConfigError: it is in a folder of captures, which may belong to another user.
     """
     if campaign.rig is None or not (file.parent / IDENTITY).exists() or is_own_rig(campaign.rig):
         return campaign.rig

@@ -90,12 +90,8 @@ def repair(folder: Path) -> Iterator[Finding]:
     """Finish interrupted work: seal whole captures, remove strays, make the index of a campaign from its files.
 
     No state is removed. A damaged one is marked as not taken, and its capture is partial again; a file that is no
-    capture any more is named and left as it is.
-
-    Raises
-    ------
-    AcquisitionError
-        Another program runs the campaign in the folder.
+    capture any more is named and left as it is. Raises AcquisitionError: another program runs the campaign in the
+    folder.
     """
     campaign = load_yaml(folder / PLAN, Campaign) if (folder / PLAN).exists() else None
     books = CampaignFolder(folder, campaign) if campaign is not None else None

@@ -57,10 +57,7 @@ def find_cameras() -> tuple[list[dict[str, str]], str]:
 def configured_devices(configuration: Path) -> list[tuple[str, str]]:
     """Label and adapter of every device in a configuration of Micro-Manager, which is read and not loaded.
 
-    Raises
-    ------
-    ProcessError
-        It cannot be read, or has no device.
+    Raises ProcessError: it cannot be read, or has no device.
     """
     lines = [line.strip().split(",") for line in read_text_of_any_system(configuration).splitlines()]
     devices = [(words[1], " ".join(words[2:])) for words in lines if words[0] == "Device" and len(words) == 4]
@@ -92,10 +89,7 @@ def rig_text(
 ) -> str:
     """A rig file as text: what was found, what can be chosen, and what only a person knows, each with a comment.
 
-    Raises
-    ------
-    ConfigError
-        The text is no rig file, which would be a mistake of this program.
+    Raises ConfigError: the text is no rig file, which would be a mistake of this program.
     """
     ports = list(ports)
     axes = [port for port in ports if port.kind is None or port.kind in device_kinds("axes")]
@@ -175,10 +169,7 @@ def _camera(cameras: Sequence[dict[str, str]], why_none: str) -> list[str]:
 def write_rig(path: Path, configuration: Path | None = None) -> str:
     """Look for devices, also in a configuration of Micro-Manager, write the file, report the devices.
 
-    Raises
-    ------
-    ProcessError
-        A file of that name exists, there is no such folder, or the configuration cannot be read.
+    Raises ProcessError: a file of that name exists, there is no such folder, or the configuration cannot be read.
     """
     require_new(path)
     (cameras, why), ports = find_cameras(), find_ports()

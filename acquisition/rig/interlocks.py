@@ -104,10 +104,7 @@ class Interlocks:
     def hold(self, state: int, why: str, stop: StopRequest) -> None:
         """Hold the axes until the interlock is closed again; reason and duration are kept.
 
-        Raises
-        ------
-        InterlockOpened
-            The plan does not go on by itself, or waiting cannot help.
+        Raises InterlockOpened: the plan does not go on by itself, or waiting cannot help.
         """
         start_s = self.rig.clock.now_s()
         self.rig.stop()

@@ -75,10 +75,7 @@ class JointAxes:
     def go(self, targets_deg: Pose, by: Sequence[Pose] = (), first: str | None = None) -> None:
         """Move to a pose by the way that `find_way` finds, if need be round what is forbidden.
 
-        Raises
-        ------
-        AcquisitionError
-            There is no such way; nothing was moved.
+        Raises AcquisitionError: there is no such way; nothing was moved.
         """
         way = find_way(self.config, self.known_pose(), targets_deg, by, limits=self.limits, first=first)
         if way is None:
@@ -151,10 +148,7 @@ class JointAxes:
     def wait(self, motions: Mapping[str, Motion]) -> dict[str, Position]:
         """Wait for all motions and return the positions read back at rest.
 
-        Raises
-        ------
-        MotionFailed
-            As the first axis that failed has it; every axis has been sent a stop.
+        Raises MotionFailed: as the first axis that failed has it; every axis has been sent a stop.
         """
         pending = dict(motions)
         positions: dict[str, Position] = {}

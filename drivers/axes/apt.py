@@ -96,9 +96,7 @@ class APTLine(ControllerLine):
     def ask(self, request: bytes, reply_id: int) -> bytes:
         """Send a request and return the data of the reply with this id; in a rack, of the unit that was asked.
 
-        Raises
-        ------
-        ReplyTimeout, ReplyError
+        Raises ReplyTimeout, ReplyError.
         """
 
         def data_of(frame: bytes) -> bytes | None:

@@ -100,9 +100,7 @@ class SMC100Line(ControllerLine):
     def ask(self, address: int, command: str, value: re.Pattern[str], reply_s: float | None = None) -> str:
         """Ask a question and return the value behind address and letters; once more if the reply is bad.
 
-        Raises
-        ------
-        ReplyTimeout, ReplyError
+        Raises ReplyTimeout, ReplyError.
         """
         start = f"{address}{command[:2]}"
 

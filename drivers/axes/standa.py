@@ -69,9 +69,7 @@ class StandaLine(ControllerLine):
     def ask(self, letters: bytes) -> tuple[Any, ...]:
         """Ask a question and return the values of the answer; once more if none came.
 
-        Raises
-        ------
-        CommandRejected, ReplyTimeout, ReplyError
+        Raises CommandRejected, ReplyTimeout, ReplyError.
         """
         with self.link.lock:
             try:

@@ -63,9 +63,7 @@ class XPSLine(ControllerLine):
     def ask(self, call: str, form: str) -> str:
         """Ask a question; returns the values of the answer, in the given form.
 
-        Raises
-        ------
-        CommandRejected, ReplyTimeout, ReplyError
+        Raises CommandRejected, ReplyTimeout, ReplyError.
         """
         label = f"XPS {self.link.port}, {call}"
         parse = text_of(re.compile(rf"0,{form}|{_ERROR}"))

@@ -295,10 +295,8 @@ class MMCoreCamera(Camera):
 def open(name: str, config: Config, clock: Clock = REAL) -> MMCoreCamera:
     """Take a camera from the core; nothing is set and nothing is exposed.
 
-    Raises
-    ------
-    CameraNotFound, CameraBusy, DeviceError
-        The core does not hold it, it is open here already or runs a sequence, or pymmcore-plus is not installed.
+    Raises CameraNotFound, CameraBusy, DeviceError: the core does not hold it, it is open here already or runs a
+    sequence, or pymmcore-plus is not installed.
     """
     asked = f"camera {name}, open {config.device}"
     core = running_core(asked, config.configuration, config.device)

@@ -17,9 +17,7 @@ from processing.whole_file import write_new_text
 def write_fitted(source: Path, target: Path, fitted: Mapping[float, FittedValues], note: str) -> None:
     """Copy an instrument file with the values fitted at some wavelengths put in; comments stay. Never overwrites.
 
-    Raises
-    ------
-    ProcessError : `target` exists.
+    Raises ProcessError: `target` exists.
     """
     yaml = YAML()
     yaml.indent(mapping=2, sequence=4, offset=2)

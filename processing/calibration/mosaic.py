@@ -37,11 +37,8 @@ def fit_response(
     """Fit the response of each raw pixel to light of known polarization; write a product "analyzers".
 
     The capture holds mosaic frames of an even field behind a polarizer that the instrument's generator turns; the
-    sample is air. Uneven light cannot be told from uneven gain and goes into the response.
-
-    Raises
-    ------
-    NotDetermined : the generator's states do not span linear polarization.
+    sample is air. Uneven light cannot be told from uneven gain and goes into the response. Raises NotDetermined: the
+    generator's states do not span linear polarization.
     """
     mosaic = capture.header.mosaic or model.mosaic
     if mosaic is None:

@@ -118,9 +118,7 @@ def front(
 ) -> list[Point]:
     """Tables from the least variance to the least time of the motors; none is worse than another in both.
 
-    Raises
-    ------
-    ProcessError : an axis of the instrument has no speed.
+    Raises ProcessError: an axis of the instrument has no speed.
     """
     missing = [axis for axis in model.axes if axis not in speeds]
     if missing:

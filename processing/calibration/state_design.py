@@ -119,9 +119,7 @@ class Design:
 def read_table(path: Path, axes: Sequence[str]) -> StateTable:
     """State table of a CSV file with a header: one column of degrees for each axis of the instrument.
 
-    Raises
-    ------
-    ProcessError : a column is missing, or a value is no number.
+    Raises ProcessError: a column is missing, or a value is no number.
     """
     lines = [line for line in read_text(path).splitlines() if line.strip()]
     header = [name.strip() for name in lines[0].split(",")] if lines else []
@@ -158,9 +156,7 @@ def read_table(path: Path, axes: Sequence[str]) -> StateTable:
 def two_retarders(model: InstrumentModel) -> tuple[Retarder, Retarder]:
     """The one turning retarder of the generator and the one of the analyzer.
 
-    Raises
-    ------
-    ProcessError : the instrument is not of that kind, so there is nothing to optimize here.
+    Raises ProcessError: the instrument is not of that kind, so there is nothing to optimize here.
     """
     retarders: list[Retarder] = []
     for side, train in (("generator", model.generator), ("analyzer", model.analyzer)):

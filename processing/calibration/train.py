@@ -261,12 +261,7 @@ class _Fit:
         return units
 
     def covariance(self, minimum: Any) -> NDArray[np.float64]:
-        """Covariance (U, U) of the unknowns.
-
-        Raises
-        ------
-        NotDetermined : a combination of parameters is left open.
-        """
+        """Covariance (U, U) of the unknowns. Raises NotDetermined: a combination of parameters is left open."""
         step = self.shared.scale[0]
         jacobian = minimum.jac * step
         _, singular, vt = np.linalg.svd(jacobian, full_matrices=False)

@@ -126,9 +126,8 @@ class TrainValues:
     def matrix(self, wavelength_nm: float) -> NDArray[np.float64]:
         """(K, U): the values at a wavelength are `base + matrix @ searched`.
 
-        Raises
-        ------
-        CalibrationError : the wavelength is outside the curve, or a value is known at the captures' wavelengths alone.
+        Raises CalibrationError: the wavelength is outside the curve, or a value is known at the captures' wavelengths
+        alone.
         """
         terms = None if self.curve is None else self.curve.terms(wavelength_nm)
         matrix = np.zeros((len(self.names), len(self.unknown)))

@@ -33,9 +33,7 @@ class WavenumberCurve:
     def over(cls, wavelengths_nm: Sequence[float], coefficients: int) -> "WavenumberCurve":
         """Curves through values at these wavelengths.
 
-        Raises
-        ------
-        CalibrationError : there are fewer wavelengths than coefficients, or one wavelength only.
+        Raises CalibrationError: there are fewer wavelengths than coefficients, or one wavelength only.
         """
         several = sorted(set(wavelengths_nm))
         if coefficients < 1:
@@ -51,9 +49,7 @@ class WavenumberCurve:
     def terms(self, wavelength_nm: float) -> NDArray[np.float64]:
         """(coefficients,) by which the coefficients add up to the value at a wavelength.
 
-        Raises
-        ------
-        CalibrationError : outside the range; a polynomial says nothing there.
+        Raises CalibrationError: outside the range; a polynomial says nothing there.
         """
         if not self.shortest_nm <= wavelength_nm <= self.longest_nm:
             raise CalibrationError(

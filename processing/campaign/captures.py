@@ -38,11 +38,7 @@ def find_captures(folder: Path, out: Path | None = None, of_objects: bool = True
     """Look for captures under a folder.
 
     Flat fields are in neither list, nor is anything in `out`, the campaign's own results. `of_objects`: leave out air,
-    mirrors and captures without an arm angle.
-
-    Raises
-    ------
-    ProcessError : no capture, or simulated and measured ones together.
+    mirrors and captures without an arm angle. Raises ProcessError: no capture, or simulated and measured ones together.
     """
     captures, kinds, left_out = [], {}, []
     damaged: list[tuple[Path, Exception]] = []
@@ -115,11 +111,8 @@ def choose(
 ) -> tuple[list[ObjectCapture], list[str]]:
     """The captures of these modes and samples (empty: of all), and the others.
 
-    Without `twins`, at most one of a kind, wavelength and angle.
-
-    Raises
-    ------
-    ProcessError : no capture is of a mode or sample, or two captures would be compared with the same others.
+    Without `twins`, at most one of a kind, wavelength and angle. Raises ProcessError: no capture is of a mode or
+    sample, or two captures would be compared with the same others.
     """
     for word, names, present in (
         ("mode", modes, {capture.mode for capture in captures}),

@@ -71,9 +71,7 @@ class Curves:
     ) -> tuple[list[tuple[Path, CurvePoint | Exception]], bool, list[str]]:
         """Work on the captures in `pool`: a result or an error of each; whether simulated; files left out.
 
-        Raises
-        ------
-        ProcessError : see `find_captures` and `choose`.
+        Raises ProcessError: see `find_captures` and `choose`.
         """
         candidates, simulated, left_out, damaged = find_captures(self.folder, self.out, of_objects=False)
         captures, omitted = choose(candidates, self.modes, self.samples, twins=True)

@@ -62,9 +62,7 @@ def compare(
 ) -> Change:
     """Compare M/m00 of two captures of one sample in tiles; what the instrument does to both does not count.
 
-    Raises
-    ------
-    ProcessError : the captures differ in sample, wavelength, frame or origin, or have no pixel in common.
+    Raises ProcessError: the captures differ in sample, wavelength, frame or origin, or have no pixel in common.
     """
     _require_alike(capture, reference)
     products = [reduce_or_open(path, instrument, progress).path for path in (capture, reference)]

@@ -119,12 +119,7 @@ class ProcessedCampaign:
 
     @one_blas_thread()
     def run(self, pool: Executor, progress: Progress | None = None) -> CampaignResult:
-        """Work on the captures in `pool` and compare.
-
-        Raises
-        ------
-        ProcessError : see `find_captures` and `choose`.
-        """
+        """Work on the captures in `pool` and compare. Raises ProcessError: see `find_captures` and `choose`."""
         candidates, simulated, left_out, damaged = find_captures(self.folder, self.out)
         captures, omitted = choose(candidates, self.modes, self.samples)
         left_out = left_out + omitted

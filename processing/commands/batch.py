@@ -150,9 +150,7 @@ def make_products(
 def place_for(inputs: Sequence[Path], out: Path | None) -> Callable[[Path], Path]:
     """Where files go: `out` in place of the usual name; a folder `out`, made if need be, takes the usual names.
 
-    Raises
-    ------
-    ProcessError : `out` is the name of a file, and there are several inputs.
+    Raises ProcessError: `out` is the name of a file, and there are several inputs.
     """
     if out is None:
         return lambda usual: usual

@@ -23,12 +23,7 @@ def instrument_effects() -> dict[str, InstrumentEffect]:
 
 
 def apply_to(changes: Changes, model: InstrumentModel, applied: AppliedEffect) -> None:
-    """Add one effect of an instrument file to the changes.
-
-    Raises
-    ------
-    EffectError : no such kind, place or parameter.
-    """
+    """Add one effect of an instrument file to the changes. Raises EffectError: no such kind, place or parameter."""
     if applied.kind == KIND:
         (value,) = applied.parameters.values()
         if model.value_of(applied.element or "") is None:

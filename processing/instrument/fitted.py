@@ -122,9 +122,7 @@ def _direction_text(direction: Iterable[Mapping[str, Any]]) -> dict[str, dict[st
 def _read_direction(direction: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     """The effects, as mappings of their fields, of values by label.
 
-    Raises
-    ------
-    ValueError : a label is none, or a text has no numbers.
+    Raises ValueError: a label is none, or a text has no numbers.
     """
     effects = []
     for label, values in direction.items():

@@ -153,12 +153,7 @@ class Sentence:
 
 @lru_cache(maxsize=4096)
 def parse_sentence(text: str) -> Sentence:
-    """The sentence of a text.
-
-    Raises
-    ------
-    KeyError : it is none.
-    """
+    """The sentence of a text. Raises KeyError: it is none."""
     quantity, _, remainder = text.partition(" of ")
     while quantity not in SIZES and not all(q in SIZES for q in quantity.split(" and ")):
         more, separator, remainder = remainder.partition(" of ")

@@ -56,10 +56,8 @@ def fit_products(
 ) -> tuple[MaterialFit, float, bool]:
     """Fit Mueller or Stokes products, see `fit_values` and `fit_plastic`: fit, wavelength, simulated.
 
-    Raises
-    ------
-    ProcessError : a kind of model that is not fitted; products of several kinds or wavelengths, simulated and measured
-        mixed, no arm angle.
+    Raises ProcessError: a kind of model that is not fitted; products of several kinds or wavelengths, simulated and
+    measured mixed, no arm angle.
     """
     if kind not in ("polarized_diffuse", "rough_plastic"):
         raise ProcessError(f"--kind {kind}: constants of polarized_diffuse and of rough_plastic can be fitted.")

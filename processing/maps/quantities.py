@@ -115,9 +115,7 @@ class _Maps(NamedTuple):
 def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
     """Maps of whole matrices, of the elements of a partial polarimeter, or of a Stokes vector.
 
-    Raises
-    ------
-    ProductError : the product holds none of these, or decompositions were asked for that need whole matrices.
+    Raises ProductError: the product holds none of these, or decompositions were asked for that need whole matrices.
     """
     if product.kind == "stokes":
         raise ProductError(
@@ -171,9 +169,7 @@ def require_decompositions(extra: Sequence[str]) -> None:
 def _partial_maps(product: Product, extra: Sequence[str], pairs: Pairs) -> list[str]:
     """The maps that a partial polarimeter determines; empty for whole matrices.
 
-    Raises
-    ------
-    ProductError : decompositions were asked for, which need whole matrices, or nothing is determined.
+    Raises ProductError: decompositions were asked for, which need whole matrices, or nothing is determined.
     """
     if product.kind == EXTRAPOLATED or int(product.facts.get("rank", 16)) == 16:
         return []

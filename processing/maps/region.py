@@ -8,9 +8,7 @@ from processing.errors import ProcessError
 def parse_region(text: str | None, shape: tuple[int, int]) -> tuple[slice, slice]:
     """Rows and columns of r0:r1,c0:c1; without a text the middle half of the frame.
 
-    Raises
-    ------
-    ProcessError : the text is no region, or not of this frame.
+    Raises ProcessError: the text is no region, or not of this frame.
     """
     height, width = shape
     if text is None:

@@ -165,16 +165,12 @@ def tabulate(
 ) -> ScatteringTable:
     """Add the images of products to a table; a new one is made if none is given.
 
-    Mueller matrices are turned into the renderer's axes pixel by pixel, so that pixels of one bin are alike.
-    xi0 products add their valid pixels; the variance of each has its covariances with the other pixels of the bin.
-    Those of Mueller images are not averaged over neighbours. The mean of each direction of the instrument's
-    uncertainty is in the table: the root of their sum of squares is the systematic uncertainty of a bin's mean. With a
-    white reference the elements are a BRDF in 1/sr, and its scale is one more direction.
-
-    Raises
-    ------
-    ProcessError
-        Products of another kind or wavelength, without an arm angle, or simulated and measured mixed.
+    Mueller matrices are turned into the renderer's axes pixel by pixel, so that pixels of one bin are alike. xi0
+    products add their valid pixels; the variance of each has its covariances with the other pixels of the bin. Those of
+    Mueller images are not averaged over neighbours. The mean of each direction of the instrument's uncertainty is in
+    the table: the root of their sum of squares is the systematic uncertainty of a bin's mean. With a white reference
+    the elements are a BRDF in 1/sr, and its scale is one more direction. Raises ProcessError: products of another kind
+    or wavelength, without an arm angle, or simulated and measured mixed.
     """
     view = ViewingGeometry.load(geometry_file)
     for done, source in enumerate(sources, 1):

@@ -41,9 +41,7 @@ class Certificate(FiniteSection):
     def load(cls, path: Path) -> Certificate:
         """Read YAML, or CSV with the columns wavelength_nm, reflectance, u, incidence_deg, viewing_deg.
 
-        Raises
-        ------
-        ProcessError : the file is neither.
+        Raises ProcessError: the file is neither.
         """
         if path.suffix.lower() != ".csv":
             return load_yaml(path, cls)
@@ -78,11 +76,8 @@ class WhiteReference(NamedTuple):
     def of(cls, plaque: Path, geometry_file: Path, certificate_file: Path) -> WhiteReference:
         """From a Mueller product of the plaque, averaged over all of its good pixels.
 
-        The uncertainty has that of the certificate, and the spread of the pixels: the light is not uniform.
-
-        Raises
-        ------
-        ProcessError : exposure, wavelength or geometry of the plaque are unknown or not those of the certificate.
+        The uncertainty has that of the certificate, and the spread of the pixels: the light is not uniform. Raises
+        ProcessError: exposure, wavelength or geometry of the plaque are unknown or not those of the certificate.
         """
         certificate = Certificate.load(certificate_file)
         with Product(plaque) as product:
@@ -119,9 +114,7 @@ class WhiteReference(NamedTuple):
     def factor(self, product: Product, image: GeometryImage) -> Array:
         """BRDF in 1/sr of one count in each pixel (N,) of an object.
 
-        Raises
-        ------
-        ProcessError : the product was not taken and reduced like the plaque, or does not know its exposure.
+        Raises ProcessError: the product was not taken and reduced like the plaque, or does not know its exposure.
         """
         names = ("wavelength", "detector", "flat field", "origin (simulated or measured)")
         differ = [n for n, a, b in zip(names, self.alike, _conditions(product), strict=True) if a != b]

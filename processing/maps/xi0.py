@@ -190,9 +190,7 @@ def xi0_of_stokes(
 ) -> dict[str, Any]:
     """Write the xi0 image of a Stokes product, with a reflectance model as the dominant process; returns its facts.
 
-    Raises
-    ------
-    ProcessError : the capture does not say its arm angle, or the object is not in the frame.
+    Raises ProcessError: the capture does not say its arm angle, or the object is not in the frame.
     """
     with Product(source) as product:
         product.require("stokes")
@@ -221,11 +219,8 @@ def xi0_of_partial(
     """Write the xi0 image of a partial polarimeter's product, with a reflectance model as the dominant process.
 
     The two coefficients need a measurement matrix of rank two only: whatever elements are determined, they are fitted.
-    Of a weighted product the errors are those of equal weights, a little too large.
-
-    Raises
-    ------
-    ProcessError : the product determines combinations of elements only; see also `dominant_model`.
+    Of a weighted product the errors are those of equal weights, a little too large. Raises ProcessError: the product
+    determines combinations of elements only; see also `dominant_model`.
     """
     with Product(source) as product:
         product.require("mueller")

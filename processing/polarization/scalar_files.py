@@ -55,10 +55,7 @@ class Scalar:
 def scalar_quantities() -> dict[str, Scalar]:
     """Every such quantity by name, in alphabetical order.
 
-    Raises
-    ------
-    ProcessError
-        A file has no `value` or no docstring, or a plug-in offers a name that exists already.
+    Raises ProcessError: a file has no `value` or no docstring, or a plug-in offers a name that exists already.
     """
     names = (module.name for module in pkgutil.iter_modules(scalars.__path__))
     found = {name: read_scalar(name, importlib.import_module(f"{scalars.__name__}.{name}")) for name in names}

@@ -16,11 +16,8 @@ ROWS = 32
 def without_cut_off(capture: Capture, states: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[str]]:
     """The states that are not cut off at zero, and a warning if some are.
 
-    Cut off counts are too high, each by another amount, and no model of the instrument explains them.
-
-    Raises
-    ------
-    CaptureError : every state is cut off.
+    Cut off counts are too high, each by another amount, and no model of the instrument explains them. Raises
+    CaptureError: every state is cut off.
     """
     detector = capture.header.detector
     gain, read = detector.gain_e_per_count, detector.read_noise_e or 0.0

@@ -44,9 +44,7 @@ class Exclusions:
     def read(cls, path: Path, capture: Capture) -> "Exclusions":
         """From a result of `diagnose --json`; empty if it lists no exclusion of this capture.
 
-        Raises
-        ------
-        ProcessError : no result of `diagnose`, or of a capture of another size.
+        Raises ProcessError: no result of `diagnose`, or of a capture of another size.
         """
         result: Any = read_json(path)
         try:
@@ -73,9 +71,7 @@ class Exclusions:
     def rest_of(self, states: NDArray[np.int64], path: Path) -> NDArray[np.int64]:
         """The numbers (N,) of the states of the sample that are not excluded.
 
-        Raises
-        ------
-        CaptureError : a state that is left out, or struck, is not among them.
+        Raises CaptureError: a state that is left out, or struck, is not among them.
         """
         if not set(self.states) | set(self.hits[:, 0].tolist()) <= set(range(len(states))):
             raise CaptureError(f"{path} has {len(states)} states; some that are to be left out are not among them.")

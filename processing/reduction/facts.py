@@ -33,9 +33,7 @@ def mueller_facts(
 ) -> dict[str, Any]:
     """Facts of a Mueller image that is written but not sealed yet.
 
-    Raises
-    ------
-    CaptureError : not one pixel could be reduced.
+    Raises CaptureError: not one pixel could be reduced.
     """
     mask, warnings = product.get("pixel_flags"), list(correction.warnings)
     good = (mask & ~np.uint8(Mask.PARTLY)) == 0

@@ -9,9 +9,7 @@ from processing.storage.captures.capture import Capture, CaptureError
 def choose_model(capture: Capture, instrument: Path | None) -> InstrumentModel:
     """The instrument model at the capture's wavelength: from a file, else the one in the capture.
 
-    Raises
-    ------
-    CaptureError : there is none, or the capture is not of that instrument.
+    Raises CaptureError: there is none, or the capture is not of that instrument.
     """
     if instrument is None:
         if capture.instrument is None:

@@ -14,9 +14,8 @@ from processing.storage.captures.capture import Capture, CaptureError
 def angles_of(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
     """Angles as read back, axis name to (states,), in degrees.
 
-    Raises
-    ------
-    CaptureError : the capture is not of this instrument, or of several colours, or an axis has no angle in some state.
+    Raises CaptureError: the capture is not of this instrument, or of several colours, or an axis has no angle in some
+    state.
     """
     require_one_colour(capture)
     angles = {name: value[states] for name, value in capture.angles_deg.items()}
@@ -35,11 +34,8 @@ def measurement_matrix(
 ) -> NDArray[np.float64]:
     """W (states, channels, 16) from the read-back angles, rows scaled with the exposure (longest = 1).
 
-    `changes` is what the model's effects do to this capture (`effects_of_capture.capture_changes`).
-
-    Raises
-    ------
-    CaptureError : see `angles_of`.
+    `changes` is what the model's effects do to this capture (`effects_of_capture.capture_changes`). Raises
+    CaptureError: see `angles_of`.
     """
     w = model.rows(angles_of(capture, model, states), changes)
     return w * relative_exposure(capture, states)[:, None, None]

@@ -250,10 +250,7 @@ class MuellerReduction:
         """A region as an image of one pixel, the mean of those that can be used, and its intensities (N channels,).
 
         Intensities are signals in counts above black. Where W varies over the image, that of the middle is taken.
-
-        Raises
-        ------
-        ProcessError : no pixel of the region can be used.
+        Raises ProcessError: no pixel of the region can be used.
         """
         solver = self.solver(capture)
         frames = solver.reader.read(rows)

@@ -110,9 +110,7 @@ def export(
 def load(path: Path | str, white_m00: float = 1.0, only_nm: float | None = None) -> dict[int, ScatteringTable]:
     """Tables by wavelength (nm) of a `.pbsdf`, one sample a bin; NaN bins stay empty.
 
-    Raises
-    ------
-    TableError : it is no pBRDF, or has other axes than 91 x 91 x 361 in the renderer's layout.
+    Raises TableError: it is no pBRDF, or has other axes than 91 x 91 x 361 in the renderer's layout.
     """
     fields = read_tensor_file(Path(path))
     lacking = {"theta_h", "theta_d", "phi_d", "wvls", "M"} - set(fields)
@@ -151,9 +149,7 @@ def model_table(
 ) -> ScatteringTable:
     """Table in 1/sr, in renderer frames and layout, of a model that has a BRDF.
 
-    Raises
-    ------
-    TableError : the model describes the dominant process alone, as all but `rough_plastic` do.
+    Raises TableError: the model describes the dominant process alone, as all but `rough_plastic` do.
     """
     if not hasattr(model, "brdf"):
         raise TableError("this kind of material has no brightness, only a dominant process. Give a rough_plastic.")

@@ -115,12 +115,7 @@ class ScatteringTable:
 
         The planes are the quantities, with `has_noise` the variance of each, then for each of `inputs` all quantities.
         All but the quantities may come from `uncertainty` instead: means over the samples of a bin, for all quantities
-        (quantities, groups) at a time.
-
-        Raises
-        ------
-        TableError
-            `simulated` differs from the table's, or shapes do not fit.
+        (quantities, groups) at a time. Raises TableError: `simulated` differs from the table's, or shapes do not fit.
         """
         if simulated is not None and simulated != self.simulated:
             raise TableError(
@@ -214,11 +209,8 @@ class ScatteringTable:
     def merge(self, other: "ScatteringTable") -> None:
         """Add all samples of another table of the same quantities, wavelength and layout.
 
-        What the inputs of another instrument do is kept apart from what those of this one do.
-
-        Raises
-        ------
-        TableError : the tables do not belong together, or one of them knows no uncertainty of its instrument.
+        What the inputs of another instrument do is kept apart from what those of this one do. Raises TableError: the
+        tables do not belong together, or one of them knows no uncertainty of its instrument.
         """
         this, that = (
             (t.quantities, t.wavelength_nm, t.axes, t.simulated, t.frames, t.has_noise, bool(t.inputs), t.scale_u)

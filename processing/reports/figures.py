@@ -34,9 +34,7 @@ UNKNOWN_XI0 = 0.1
 def draw_product(path: Path, figure: Path) -> None:
     """Draw a product into a PNG, SVG or PDF file, by its kind.
 
-    Raises
-    ------
-    ProcessError : there is no figure for that kind, or the file's ending is unknown.
+    Raises ProcessError: there is no figure for that kind, or the file's ending is unknown.
     """
     with Product(path) as product:
         drawn = product_figure(product)

@@ -43,11 +43,8 @@ ROWS = 200
 def collect(sources: Sequence[Path]) -> list[Path]:
     """Files for a report: those given, and those in the folders given; curves and pictures first, then the oldest.
 
-    A picture beside an HDF5 file of its name shows what that file's own section shows, and is left out.
-
-    Raises
-    ------
-    ProcessError : a source does not exist, or nothing is there.
+    A picture beside an HDF5 file of its name shows what that file's own section shows, and is left out. Raises
+    ProcessError: a source does not exist, or nothing is there.
     """
     files: list[Path] = []
     for source in sources:
@@ -90,11 +87,8 @@ def write_report(
 ) -> Path:
     """Write one self-contained HTML file about captures, products, CSV tables and pictures.
 
-    A report of the same sources under the same title is made again without `overwrite`.
-
-    Raises
-    ------
-    ProcessError : nothing to report, `out` exists, or simulated and measured data are mixed.
+    A report of the same sources under the same title is made again without `overwrite`. Raises ProcessError: nothing to
+    report, `out` exists, or simulated and measured data are mixed.
     """
     key = sha256("\0".join([title, *map(os.path.realpath, sources)]).encode()).hexdigest()
     mark = f"<!-- umov report {key} -->\n"

@@ -57,10 +57,8 @@ class FileStep(OfFiles, ABC):
     def make(self, out: Path | str | None = None, overwrite: bool = False, progress: Progress | None = None) -> Path:
         """Make the product, whatever is there; `overwrite` replaces a file of that name.
 
-        Raises
-        ------
-        ProcessError : the file exists and `overwrite` is false, its folder is not there, or its name is that of no HDF5
-            file of ours: reports, campaigns and the browser find files by it.
+        Raises ProcessError: the file exists and `overwrite` is false, its folder is not there, or its name is that of
+        no HDF5 file of ours: reports, campaigns and the browser find files by it.
         """
         out = Path(out) if out else self.usual_path
         require_place(out, overwrite)

@@ -164,10 +164,7 @@ class Reduction(FileStep):
 def reduce_or_open(source: Path, instrument: Path | None = None, progress: Progress | None = None) -> StepProduct:
     """A product as it is; for a capture its plain product, found or made.
 
-    Raises
-    ------
-    ProcessError
-        An instrument file was given for a product.
+    Raises ProcessError: an instrument file was given for a product.
     """
     if not is_product(source):
         return Reduction(source, instrument).found_or_made(progress=progress)

@@ -62,11 +62,7 @@ def counts_of(source: PixelSource, info: ExposureInfo, fmt: PixelFormat, bits: i
     """Counts that a pixel source of so many bits gives for an exposure, cut to the bits of a format.
 
     A format that sends each super-pixel as one pixel has its region in super-pixels; the source is asked for pixels.
-
-    Raises
-    ------
-    ValueError
-        The source gave another shape or type, or counts of more bits.
+    Raises ValueError: the source gave another shape or type, or counts of more bits.
     """
     left, top, width, height = (fmt.scale * edge for edge in info.region)
     pixels = source(replace(info, width=width, height=height, offset_x=left, offset_y=top))

@@ -163,10 +163,7 @@ class GigeCamera:
     def start(self) -> None:
         """Start the camera; after `vanish` it is as after being switched on.
 
-        Raises
-        ------
-        CameraError
-            The address is taken or does not exist.
+        Raises CameraError: the address is taken or does not exist.
         """
         self._loopback.take(self._wait_s)
         self.address = self._loopback.address
@@ -221,10 +218,7 @@ class GigeCamera:
     def leave(self, name: str, value: Number | str) -> None:
         """Set a feature as another program left it: a number, an entry, or 0 and 1 for a flag.
 
-        Raises
-        ------
-        NodeError
-            It cannot be set.
+        Raises NodeError: it cannot be set.
         """
         with self._lock:
             if isinstance(value, str):

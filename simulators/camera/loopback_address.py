@@ -41,10 +41,7 @@ class LoopbackAddress:
     def take(self, wait_s: float) -> None:
         """Wait until the address is free and hold it; harmless if it is held already.
 
-        Raises
-        ------
-        CameraError
-            No interface has the address, or a camera kept it for longer than `wait_s`.
+        Raises CameraError: no interface has the address, or a camera kept it for longer than `wait_s`.
         """
         if self._socket is not None:
             return

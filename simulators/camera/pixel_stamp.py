@@ -40,13 +40,7 @@ def stamp(pixels: NDArray[np.uint16], values: Sequence[float], bits: int = 12) -
 
 
 def read_stamp(pixels: NDArray[np.uint16], bits: int = 12) -> tuple[float, ...]:
-    """Read the numbers that `stamp` wrote.
-
-    Raises
-    ------
-    ValueError
-        There is no stamp, or it was disturbed.
-    """
+    """Read the numbers that `stamp` wrote. Raises ValueError: there is no stamp, or it was disturbed."""
     count = int(_read_bytes(pixels, 2, bits)[1])
     length = 2 + 8 * count + 4
     if 2 * length > pixels.size:

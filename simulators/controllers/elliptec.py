@@ -63,12 +63,7 @@ class ElliptecModule:
         return f"PO{round(self.axis.position_deg() * self.per_deg) - self.offset_counts & 0xFFFFFFFF:08X}"
 
     def run(self, letters: str, data: str) -> str | None:
-        """Do one command; return the reply, or None if it comes when the move ends.
-
-        Raises
-        ------
-        ElliptecError
-        """
+        """Do one command; return the reply, or None if it comes when the move ends. Raises ElliptecError."""
         if letters == "gs":
             status, self.status = (9 if self.axis.is_moving() else self.status), 0
             return f"GS{status:02X}"

@@ -83,10 +83,7 @@ class SMC100Controller:
     def run(self, letters: str, value: str) -> str | None:
         """Do one command; return the reply's value, or None where the real one answers nothing.
 
-        Raises
-        ------
-        Smc100Error
-            With the letter of the error.
+        Raises Smc100Error with the letter of the error.
         """
         handlers: dict[str, Callable[[str], str | None]] = {
             "VE": lambda _: " " + self.version,

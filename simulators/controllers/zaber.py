@@ -80,13 +80,7 @@ class ZaberDevice:
         return round(axis.position_deg() * self.per_deg)
 
     def run(self, words: list[str]) -> str:
-        """Do one command and return its data field.
-
-        Raises
-        ------
-        Rejected
-            With the word of the rejection.
-        """
+        """Do one command and return its data field. Raises Rejected with the word of the rejection."""
         command, arguments = (words[0], words[1:]) if words else ("", [])
         handlers: dict[str, Callable[[list[str]], str]] = {
             "": lambda _: "0",

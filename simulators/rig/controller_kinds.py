@@ -46,10 +46,7 @@ def _entries(function: str, emulator: Emulator, port: str) -> list[Any]:
 def served_kinds() -> dict[str, Callable[[ServeOptions], Emulator]]:
     """Find what can be served: the `SERVES` table of every module in `simulators/controllers/`, and of plug-ins.
 
-    Raises
-    ------
-    ValueError
-        A plug-in serves a kind that exists already.
+    Raises ValueError: a plug-in serves a kind that exists already.
     """
     kinds: dict[str, Callable[[ServeOptions], Emulator]] = {}
     for entry in pkgutil.iter_modules(simulators.controllers.__path__):

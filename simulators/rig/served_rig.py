@@ -30,10 +30,7 @@ def serve(
 ) -> Iterator[SimulatedRig]:
     """Start the emulators of a rig file and write `target`, the same rig with device paths in place of `sim:` ports.
 
-    Raises
-    ------
-    ConfigError
-        The file has no usable `simulator` section, or there is no such sample or mode.
+    Raises ConfigError: the file has no usable `simulator` section, or there is no such sample or mode.
     """
     config = load_yaml(rig_file, _RigFile).simulator.below(rig_file.resolve().parent)
     yaml = YAML()

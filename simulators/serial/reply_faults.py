@@ -51,10 +51,7 @@ _SPEC = re.compile(r"(?P<kind>\w+)(?:@(?P<at>\d+(?:\.\d+)?)(?P<unit>s?))?(?:x(?P
 def parse_fault(text: str) -> Fault:
     """Read ``KIND[@COMMAND|@TIMEs][xCOUNT][:AMOUNT]``, such as ``garbled@12x1`` or ``slow@3.5s:0.2``.
 
-    Raises
-    ------
-    ValueError
-        The text has another form or names an unknown kind.
+    Raises ValueError: the text has another form or names an unknown kind.
     """
     match = _SPEC.fullmatch(text)
     if match is None or match["kind"] not in get_args(FaultKind):

@@ -35,13 +35,7 @@ class ServedPort(ABC):
         return self._thread.is_alive()
 
     def close(self) -> None:
-        """Stop serving and remove the port.
-
-        Raises
-        ------
-        RuntimeError
-            The emulator itself failed while it served.
-        """
+        """Stop serving and remove the port. Raises RuntimeError: the emulator itself failed while it served."""
         if self._thread.is_alive():
             os.write(self._wake_write, b"x")
             self._thread.join()

@@ -32,9 +32,7 @@ def optimize_angles(
 ) -> StateTable:
     """Optimize, print, and return the (last) best table; `now` has what is measured now for each number of states.
 
-    Raises
-    ------
-    ProcessError : what may change is no such thing, an axis is unknown, or no table determines all.
+    Raises ProcessError: what may change is no such thing, an axis is unknown, or no table determines all.
     """
     names = {name.strip() for name in free.split(",")}
     if not names <= MAY_CHANGE:

@@ -67,9 +67,7 @@ class DetectorNoise:
 def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
     """Noise of a capture against rows a (L, K) of its model; None where its images do not show it.
 
-    Raises
-    ------
-    CaptureError : the frames have none.
+    Raises CaptureError: the frames have none.
     """
     height, width = data.usable.shape
     if min(height, width) < NARROWEST:

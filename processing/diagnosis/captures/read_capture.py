@@ -153,9 +153,7 @@ def _clip_level(capture: Capture, correction: CountCorrection) -> float | None:
 def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     """Read the sample states of a capture; `model` is resolved at its wavelength.
 
-    Raises
-    ------
-    CaptureError : nothing to compare, or angles that the model does not have.
+    Raises CaptureError: nothing to compare, or angles that the model does not have.
     """
     states = sample_states(capture)
     angles_of(capture, model, states)
@@ -235,9 +233,7 @@ def _places_px(model: InstrumentModel, side: int) -> Array | None:
 def without_dark_pixels(data: CaptureData) -> CaptureData:
     """The capture without pixels that show nothing but noise, and without the rim around them.
 
-    Raises
-    ------
-    CaptureError : nothing else is there.
+    Raises CaptureError: nothing else is there.
     """
     mean = data.signal.mean(axis=(0, 1), dtype=np.float64)
     dark = mean < LIMIT * np.sqrt(np.maximum(data.slope.mean() * mean + data.floor.mean(), 0))

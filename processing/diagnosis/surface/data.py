@@ -92,9 +92,7 @@ def read_surface(
 ) -> SurfaceData:
     """Read the pixels of a capture that see the object.
 
-    Raises
-    ------
-    ProcessError : no arm angle, no noise, or too few pixels of the object.
+    Raises ProcessError: no arm angle, no noise, or too few pixels of the object.
     """
     if capture.header.mode == "drr" and model.mosaic is not None:
         raise ProcessError(

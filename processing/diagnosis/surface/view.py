@@ -228,9 +228,7 @@ def _disc(depth_mm: float, radius_mm: float) -> Array:
 def material_constants(material: ReflectanceModel, wavelength_nm: float) -> tuple[complex, float, float]:
     """n + i k, a and b of a material at a wavelength; a = 0 and b = 2 for a first surface alone.
 
-    Raises
-    ------
-    ProcessError : a kind of material that the effects cannot act on.
+    Raises ProcessError: a kind of material that the effects cannot act on.
     """
     if isinstance(material, first_surface.Model):
         plain = constants_at(material.constants, wavelength_nm, material.name)

@@ -47,10 +47,7 @@ class DemosaicingMethod:
 def demosaicing_methods() -> dict[str, DemosaicingMethod]:
     """Every method by name, in alphabetical order.
 
-    Raises
-    ------
-    MosaicError
-        A file lacks a part, or a plug-in offers a name that exists already.
+    Raises MosaicError: a file lacks a part, or a plug-in offers a name that exists already.
     """
     found = {}
     for info in pkgutil.iter_modules(methods.__path__):

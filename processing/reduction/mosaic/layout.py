@@ -42,9 +42,7 @@ class MosaicLayout:
     ) -> "MosaicLayout":
         """From rows of channel names, e.g. (("90", "45"), ("135", "0")), and the rows (channels, 3) of their analyzers.
 
-        Raises
-        ------
-        MosaicError : it is not 2 x 2.
+        Raises MosaicError: it is not 2 x 2.
         """
         where = {name: (r, c) for r, row in enumerate(mosaic) for c, name in enumerate(row)}
         if len(mosaic) != 2 or any(len(row) != 2 for row in mosaic) or set(where) != set(channels):

@@ -37,9 +37,7 @@ class FieldMatrix:
     def of(cls, matrix: Callable[[float, float], Array], what: str) -> "FieldMatrix":
         """Interpolate `matrix(y, x)`, y and x from -1 to 1, down and to the right.
 
-        Raises
-        ------
-        NotDetermined : the matrix changes too fast over the image; the message begins with `what`.
+        Raises NotDetermined: the matrix changes too fast over the image; the message begins with `what`.
         """
         trials = np.random.default_rng(0).uniform(-1, 1, (8, 2))
         true = np.stack([matrix(y, x) for y, x in trials])

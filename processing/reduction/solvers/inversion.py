@@ -47,10 +47,8 @@ class Inversion:
     ) -> "Inversion":
         """Invert a measurement matrix (N, 16); `basis` (16, R) is what the instrument can determine, default all.
 
-        Raises
-        ------
-        NotDetermined
-            W has a rank below R; the message names the rank and the elements of M that the states cannot see.
+        Raises NotDetermined: W has a rank below R; the message names the rank and the elements of M that the states
+        cannot see.
         """
         basis = np.eye(w.shape[1]) if basis is None else basis
         seen = w @ basis

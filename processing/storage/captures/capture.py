@@ -357,9 +357,7 @@ def _open(path: Path) -> h5py.File:
 def full_model(path: Path, instrument: Path | None) -> InstrumentModel:
     """The instrument at all wavelengths that it has: of its file, without one as a capture holds it.
 
-    Raises
-    ------
-    CaptureError : the capture holds no model.
+    Raises CaptureError: the capture holds no model.
     """
     if instrument is not None:
         return InstrumentModel.load(instrument)

@@ -25,11 +25,8 @@ Colours = tuple[tuple[str, ...], ...]
 def split_colours(path: Path, folder: Path) -> tuple[list[Path], bool]:
     """Write a capture for each colour, the two greens apart.
 
-    Returns their paths, and whether all of them existed, made of the same capture by the same version.
-
-    Raises
-    ------
-    ProcessError : the capture has no colour filter, the frames are too small, or another file has one of the names.
+    Returns their paths, and whether all of them existed, made of the same capture by the same version. Raises
+    ProcessError: the capture has no colour filter, the frames are too small, or another file has one of the names.
     """
     with Capture(path) as capture:
         colours = capture.header.colours

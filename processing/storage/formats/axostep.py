@@ -108,9 +108,7 @@ class MuellerFile:
 def read_mueller_file(path: Path) -> MuellerFile:
     """Read a .cmmi file, or a .bmmi file (by its ending: no reduced parameters).
 
-    Raises
-    ------
-    AxoStepError : neither header fits, or the file ends too early.
+    Raises AxoStepError: neither header fits, or the file ends too early.
     """
     raw = _words(path)
     floats = raw.view(">f4")

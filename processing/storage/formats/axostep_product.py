@@ -21,11 +21,8 @@ def product_of_axostep(
 ) -> tuple[list[str], bool]:
     """Write a Mueller product with the image of a .cmmi or .bmmi file, unless `out` is exactly that product.
 
-    Returns what was found in the file, in words, and whether the product existed.
-
-    Raises
-    ------
-    AxoStepError : the file cannot be read, or nothing says the wavelength.
+    Returns what was found in the file, in words, and whether the product existed. Raises AxoStepError: the file cannot
+    be read, or nothing says the wavelength.
     """
     if source.suffix.lower() not in (".cmmi", ".bmmi"):
         raise AxoStepError(f"{source}: expected a .cmmi or .bmmi file; raw .rmmd files go to `process import --stack`")

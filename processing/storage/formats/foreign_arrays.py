@@ -147,11 +147,8 @@ class FrameFiles:
 def frame_files(text: str) -> FrameFiles | None:
     """The frames of a folder or a pattern such as `run/*.tif`, frame 2 before frame 10; None of a single file.
 
-    A pattern may have names of axes, as `run/G{psg}_A{psa}.tif`: the file names then have the angles.
-
-    Raises
-    ------
-    ImportFailed : the folder has no frames, or no file is of that pattern.
+    A pattern may have names of axes, as `run/G{psg}_A{psa}.tif`: the file names then have the angles. Raises
+    ImportFailed: the folder has no frames, or no file is of that pattern.
     """
     folder, numbers = Path(text), {}
     if folder.is_dir():

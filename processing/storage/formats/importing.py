@@ -125,9 +125,7 @@ def _files_of(request: ImportRequest, understood: ImportPlan) -> list[Path]:
 def import_capture(request: ImportRequest, progress: Progress | None = None) -> CaptureHeader:
     """Write a capture file from states and their frames; returns the header that was written.
 
-    Raises
-    ------
-    ProcessError, ConfigError, WavelengthError : as `understand`, or the capture exists already.
+    Raises ProcessError, ConfigError, WavelengthError: as `understand`, or the capture exists already.
     """
     require_place(request.out, request.overwrite, captures_too=True)
     understood = understand(request)

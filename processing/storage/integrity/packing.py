@@ -87,10 +87,7 @@ def create_packed(parent: h5py.Group, name: str, shape: tuple[int, ...], dtype: 
 def pack(source: h5py.Dataset, target: h5py.Dataset, packing: Packing | None = None) -> None:
     """Copy every value of a dataset into one made by `create_packed`, an image at a time.
 
-    Raises
-    ------
-    OSError
-        The disc is full, or the source cannot be read.
+    Raises OSError: the disc is full, or the source cannot be read.
     """
     deflated = (packing or Packing.of(source)).deflated
     height, threads = target.chunks[-2], thread_count()

@@ -54,10 +54,8 @@ def is_description(name: str) -> bool:
 def read_description(path: Path) -> Description:
     """Read a GenICam description of at most 16 MiB, unpacked.
 
-    Raises
-    ------
-    ConfigError
-        Not there, too large, nested too deep, with a document type (which could define entities), or no GenICam.
+    Raises ConfigError: not there, too large, nested too deep, with a document type (which could define entities), or no
+    GenICam.
     """
     require_file(path, ConfigError, MOST_TEXT_BYTES)
     try:
