@@ -275,27 +275,13 @@ def turning_retarders(model: InstrumentModel) -> tuple[str, ...]:
 
 def with_retardances(model: InstrumentModel, retardances_deg: Mapping[str, float]) -> InstrumentModel:
     """A copy of the model with other retardances."""
-    if not retardances_deg:
-        return model
-
-    def change(elements: Sequence[object]) -> tuple[object, ...]:
-        return tuple(
-            e.model_copy(update={"retardance_deg": float(retardances_deg[e.name])})
-            if isinstance(e, Retarder) and e.name in retardances_deg
-            else e
-            for e in elements
-        )
-
-    channels = tuple(c.model_copy(update={"elements": change(c.elements)}) for c in model.channels)
-    return model.model_copy(
-        update={"generator": change(model.generator), "analyzer": change(model.analyzer), "channels": channels}
-    )
+    values = {name: {"retardance_deg": float(value)} for name, value in retardances_deg.items()}
+    return model.with_values(values) if values else model
 
 
 def retardance_deg(model: InstrumentModel, name: str) -> float:
     """Retardance of an element at the model's wavelength; ProcessError where several are given."""
-    element = next(e for e in model.elements() if e.name == name)
-    value = getattr(element, "retardance_deg", None)
+    value = model.value_of(f"{name}.retardance_deg")
     if not isinstance(value, float | int):
         raise ProcessError("the instrument has values for several wavelengths; give --wavelength")
     return float(value)

@@ -65,10 +65,10 @@ class CaptureMeasure:
     omega_deg: float
     shape: tuple[int, int]
     table: str
-    psi_deg: float
-    magnitude_percent: float
-    eigenvalue_deviation: float
     pixels: int
+    psi_deg: float = np.nan
+    magnitude_percent: float = np.nan
+    eigenvalue_deviation: float = np.nan
     #: What the noise alone makes of psi_deg and magnitude_percent.
     psi_noise_deg: float = np.nan
     magnitude_noise_percent: float = np.nan
@@ -195,9 +195,6 @@ def _measure_stokes(task: CaptureTask, product: Path, view: ViewingGeometry) -> 
         omega_deg=float(header.omega_deg or 0.0),
         shape=(image.mask.shape[0], image.mask.shape[1]),
         table=_table(task, product, geometry, (xi0, stderr, good), systematic=systematic, moves=moves),
-        psi_deg=float("nan"),
-        magnitude_percent=float("nan"),
-        eigenvalue_deviation=float("nan"),
         pixels=int(good.sum()),
     )
 

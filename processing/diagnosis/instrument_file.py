@@ -1,7 +1,5 @@
 """Write the instrument model with the effects that were found: `diagnose --write`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from processing.diagnosis.search.result import Diagnosis

@@ -314,12 +314,6 @@ class InstrumentModel(Section):
         return w if changes is None else _detected(w, changes)
 
 
-def condition_number(w: ArrayLike) -> float:
-    """Ratio of the largest to the smallest singular value of W (any leading shape, 16)."""
-    s = np.linalg.svd(np.asarray(w, dtype=float).reshape(-1, 16), compute_uv=False)
-    return float(s[0] / s[-1]) if s.size == 16 and s[-1] > 0 else float("inf")
-
-
 def rank(w: ArrayLike) -> int:
     """Numerical rank of W (any leading shape, 16), relative tolerance 1e-8."""
     return int(np.linalg.matrix_rank(np.asarray(w, dtype=float).reshape(-1, 16), rtol=1e-8))

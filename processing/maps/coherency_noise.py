@@ -1,7 +1,5 @@
 """Noise of the coherency matrices of a Mueller image, from the image's own covariance."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ Noise pushes equal eigenvalues apart, so that errors to first order are too smal
 which planes hold an interval.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.arrays import Array, RealArray

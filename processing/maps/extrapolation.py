@@ -3,8 +3,6 @@
 Jarecki and Kupinski, Sec. V-C.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self

@@ -6,8 +6,6 @@ and what divides by a weak factor are not; docs/quantities.md, "Standard errors"
 `<name>_95` the lower and upper bound of the 95 % interval by both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Protocol
 

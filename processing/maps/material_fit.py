@@ -1,7 +1,5 @@
 """Material constants from products of `process reduce`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path

@@ -4,8 +4,6 @@ Diattenuation needs the first row of M, polarizance the first column, light betw
 two polarizations meet. Eigenvalues and decompositions need all 16.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Every derived map of a Mueller image, with its standard error, as a product file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Planes of a product of quantities: names, units, and what each is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What each quantity can be: its range, and for an angle one period."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.arrays import Array

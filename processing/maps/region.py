@@ -1,7 +1,5 @@
 """The part of a frame that an option names."""
 
-from __future__ import annotations
-
 from processing.errors import ProcessError
 
 

@@ -5,8 +5,6 @@ first column of the matrix that makes this light of unpolarized light: its degre
 ellipticity are those of that matrix's polarizance.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Fill tables over scattering geometry from products: Mueller matrices, or xi0."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations_with_replacement
 from pathlib import Path

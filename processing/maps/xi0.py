@@ -1,7 +1,5 @@
 """xi0 images: coherency eigenvalues of a Mueller image, or the two-coefficient estimate of a Stokes image."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -23,14 +23,3 @@ def mueller_matrix(m0: ArrayLike, xi0: ArrayLike, m00: ArrayLike = 1.0) -> RealA
     out = np.asarray(m * ((4.0 * t / 3.0) * (xi - 0.25))[..., None, None])
     out[..., 0, 0] += (4.0 * t / 3.0) * (1.0 - xi)
     return out
-
-
-def coefficients(xi0: ArrayLike, m00: ArrayLike = 1.0) -> tuple[RealArray, RealArray]:
-    """alpha_0 and alpha_ID, each (...), the weights of m0 and of the ideal depolarizer (the paper's Eq. 6)."""
-    xi, t = np.asarray(xi0, dtype=float), np.asarray(m00, dtype=float)
-    return np.asarray(4 * t / 3 * (xi - 0.25)), np.asarray(4 * t / 3 * (1 - xi))
-
-
-def depolarization_index(xi0: ArrayLike) -> RealArray:
-    """|4 xi0 - 1| / 3 of TD matrices, (...) as xi0; not monotonic below xi0 = 1/4."""
-    return np.asarray(np.abs(4 * np.asarray(xi0, dtype=float) - 1) / 3)

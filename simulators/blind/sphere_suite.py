@@ -13,6 +13,7 @@ from simulators.bench.bench import DETECTOR, SceneImage, SimulatedBench
 from simulators.bench.scene import Scene
 from simulators.bench.virtual_capture import write_virtual_capture
 from simulators.blind import scene_faults
+from simulators.blind.undeclared_faults import draw_signed
 
 EXPOSURE_S = 0.02
 #: Image size and number of states of a full Mueller and of a linear Stokes capture.
@@ -74,11 +75,11 @@ def first_surface_of(material: Any) -> first_surface.Model:
 def _add_fault(kind: str, random: np.random.Generator, so_far: SphereFault) -> SphereFault:
     scene, instrument, truth = so_far.scene, so_far.instrument, dict[str, float]()
     if kind == "arm_zero":
-        truth = {"arm": _signed(random, 0.7, 4.0)}
+        truth = {"arm": draw_signed(random, 0.7, 4.0)}
         return _extend(so_far, kind, truth, scene=scene_faults.ArmZeroFault(scene, truth["arm"]))
     if kind in ("illumination_azimuth", "analyzer_roll"):
         turn = scene_faults.turned_generator if kind == "illumination_azimuth" else scene_faults.turned_analyzer
-        truth = {"azimuth": _signed(random, 0.4, 5.0)}
+        truth = {"azimuth": draw_signed(random, 0.4, 5.0)}
         return _extend(so_far, kind, truth, instrument=turn(instrument, truth["azimuth"]))
     if not isinstance(scene, Scene):
         raise ValueError(f"{kind} has to be put in before what stands in front of the scene")
@@ -159,7 +160,3 @@ def take(
         fault.scene, fault.instrument, wavelength_nm, rows=size, columns=size, flux_e_per_s=flux, seed=seed
     )
     write_virtual_capture(path, bench, declared, omega_deg, exposure_s=EXPOSURE_S, states=states, name=path.stem)
-
-
-def _signed(random: np.random.Generator, low: float, high: float) -> float:
-    return float(np.exp(random.uniform(np.log(low), np.log(high))) * random.choice([-1, 1]))

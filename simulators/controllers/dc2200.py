@@ -5,6 +5,7 @@ import re
 from drivers.sources.dc2200 import Config
 from simulators.clock import FastClock
 from simulators.serial.emulator import Emulator
+from simulators.serial.line_collector import LineCollector
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
 
@@ -31,7 +32,7 @@ class DC2200Emulator(Emulator):
         self._mode = ["CC", "CC"]
         self._percent = [100.0, 100.0]
         self._error = 0
-        self._buffer = bytearray()
+        self._lines = LineCollector(b"\n")
 
     def light_at(self, wavelength_nm: float) -> float:
         """Light of the LEDs near a wavelength; a filter keeps that of the other from the sample."""
@@ -43,11 +44,8 @@ class DC2200Emulator(Emulator):
             )
 
     def _do_receive(self, data: bytes) -> None:
-        self._buffer += data
-        while (end := self._buffer.find(b"\n")) >= 0:
-            text = bytes(self._buffer[:end]).decode("ascii", "replace").strip()
-            del self._buffer[: end + 1]
-            if text:
+        for line in self._lines.lines(data):
+            if text := line.strip():
                 self._apply_faults()
                 answer = self._run(text.upper())
                 if answer is not None:
@@ -75,9 +73,8 @@ class DC2200Emulator(Emulator):
         if name is None or (name == "STAT") != (part == "OUTP"):
             return None
         if words[0].endswith("?"):
-            return {"STAT": str(int(self._on[led])), "MODE": self._mode[led], "LEVEL": f"{self._percent[led]:.1f}"}[
-                name
-            ]
+            values = {"STAT": str(int(self._on[led])), "MODE": self._mode[led], "LEVEL": f"{self._percent[led]:.1f}"}
+            return values[name]
         value = words[1] if len(words) == 2 else ""
         if name == "STAT" and value in ("ON", "OFF", "1", "0"):
             self._on[led] = value in ("ON", "1")

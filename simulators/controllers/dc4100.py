@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from drivers.sources.dc4100 import Config
 from simulators.clock import FastClock
 from simulators.serial.emulator import Emulator
+from simulators.serial.line_collector import LineCollector
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
 
@@ -49,7 +50,7 @@ class DC4100Emulator(Emulator):
         self._milliampere = [0.0] * 4
         self._mode = 0
         self._error = (0, "no error")
-        self._buffer = bytearray()
+        self._lines = LineCollector(b"\n")
 
     def light(self) -> dict[float, float]:
         """Relative light now, 0 to 1, by wavelength in nm; wavelengths that are off are left out."""
@@ -73,19 +74,12 @@ class DC4100Emulator(Emulator):
                 self._on = [False] * 4
 
     def _do_receive(self, data: bytes) -> None:
-        self._buffer += data
-        while (end := self._buffer.find(b"\n")) >= 0:
-            words = bytes(self._buffer[:end]).decode("ascii", "replace").lower().split()
-            del self._buffer[: end + 1]
-            if not words:
-                continue
-            self._apply_faults()
-            answer = self._answer(words)
-            if answer is not None:
-                self._reply(answer.encode() + b"\r\n")
-        # No command is as long as this: noise without an end.
-        if len(self._buffer) > 256:
-            self._buffer.clear()
+        for line in self._lines.lines(data):
+            if words := line.lower().split():
+                self._apply_faults()
+                answer = self._answer(words)
+                if answer is not None:
+                    self._reply(answer.encode() + b"\r\n")
 
     def _answer(self, words: list[str]) -> str | None:
         name, arguments = words[0], words[1:]

@@ -138,11 +138,11 @@ class ESP301Emulator(Emulator):
             "PA": self._absolute,
             "PR": lambda stage, axis, text: self._absolute(stage, axis, f"{stage.position() + _number(text)}"),
             "ST": lambda stage, *_: self._stop(stage),
-            "VA": self._velocity,
-            "AC": self._acceleration,
-            "AG": self._acceleration,
-            "SL": self._left_limit,
-            "SR": self._right_limit,
+            "VA": lambda stage, axis, value: self._speed(stage, axis, value, "speed_deg_s"),
+            "AC": lambda stage, axis, value: self._speed(stage, axis, value, "acceleration_deg_s2"),
+            "AG": lambda stage, axis, value: self._speed(stage, axis, value, "acceleration_deg_s2"),
+            "SL": lambda stage, _, value: self._limit(stage, value, "min_deg", -1e6),
+            "SR": lambda stage, _, value: self._limit(stage, value, "max_deg", 1e6),
             "SN": self._unit,
             "DH": self._define_home,
             "WS": self._wait_stop,
@@ -228,28 +228,19 @@ class ESP301Emulator(Emulator):
         stage.axis.move_to(reported_deg)
         return None
 
-    def _velocity(self, stage: ESPAxis, axis: int, value: str) -> str | None:
+    def _speed(self, stage: ESPAxis, axis: int, value: str, name: str) -> str | None:
         if value == "?":
-            return f"{stage.axis.speed_deg_s:g}"
-        stage.axis.speed_deg_s = _positive(value, axis)
+            return f"{getattr(stage.axis, name):g}"
+        if _number(value) <= 0:
+            raise Esp301Error(axis * 100 + 1)
+        setattr(stage.axis, name, _number(value))
         return None
 
-    def _acceleration(self, stage: ESPAxis, axis: int, value: str) -> str | None:
+    def _limit(self, stage: ESPAxis, value: str, name: str, without: float) -> str | None:
         if value == "?":
-            return f"{stage.axis.acceleration_deg_s2:g}"
-        stage.axis.acceleration_deg_s2 = _positive(value, axis)
-        return None
-
-    def _left_limit(self, stage: ESPAxis, _: int, value: str) -> str | None:
-        if value == "?":
-            return f"{-1e6 if stage.axis.min_deg is None else stage.axis.min_deg - stage.offset_deg:g}"
-        stage.axis.min_deg = _number(value) + stage.offset_deg
-        return None
-
-    def _right_limit(self, stage: ESPAxis, _: int, value: str) -> str | None:
-        if value == "?":
-            return f"{1e6 if stage.axis.max_deg is None else stage.axis.max_deg - stage.offset_deg:g}"
-        stage.axis.max_deg = _number(value) + stage.offset_deg
+            limit_deg = getattr(stage.axis, name)
+            return f"{without if limit_deg is None else limit_deg - stage.offset_deg:g}"
+        setattr(stage.axis, name, _number(value) + stage.offset_deg)
         return None
 
     def _unit(self, stage: ESPAxis, _: int, value: str) -> str | None:
@@ -277,13 +268,6 @@ def _number(value: str) -> float:
     if value in ("", "?"):
         raise Esp301Error(38)
     return float(value)
-
-
-def _positive(value: str, axis: int) -> float:
-    number = _number(value)
-    if number <= 0:
-        raise Esp301Error(axis * 100 + 1)
-    return number
 
 
 def make(options: ServeOptions) -> ESP301Emulator:

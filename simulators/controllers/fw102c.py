@@ -3,6 +3,7 @@
 from drivers.sources.fw102c import Config
 from simulators.clock import FastClock
 from simulators.serial.emulator import Emulator
+from simulators.serial.line_collector import LineCollector
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
 
@@ -32,7 +33,7 @@ class FW102CEmulator(Emulator):
         self._arrives_s = -1e9
         # Reply to the move under way, and what came in meanwhile: the wheel answers nothing while it turns.
         self._due: bytes | None = None
-        self._buffer = bytearray()
+        self._lines, self._waiting = LineCollector(b"\r"), list[str]()
 
     def light_at(self, wavelength_nm: float) -> float:
         """1 behind the filter of a wavelength, 0 behind another one and while the wheel turns."""
@@ -43,21 +44,19 @@ class FW102CEmulator(Emulator):
             return float(nm is not None and abs(nm - wavelength_nm) < _HALF_BAND_NM)
 
     def _do_receive(self, data: bytes) -> None:
-        self._buffer += data
+        self._waiting += [line.strip("\n") for line in self._lines.lines(data)]
         self._work()
 
     def _work(self) -> None:
-        while self._due is None and (end := self._buffer.find(b"\r")) >= 0:
-            command = bytes(self._buffer[:end]).strip(b"\n")
-            del self._buffer[: end + 1]
+        while self._due is None and self._waiting:
+            text = self._waiting.pop(0)
             self._apply_faults()
-            text = command.decode("ascii", "replace")
             if text.startswith("pos=") and text[4:].isdigit() and 1 <= int(text[4:]) <= 6:
                 self._turn(int(text[4:]))
-                self._due = command + b"\r" + PROMPT
+                self._due = f"{text}\r".encode("latin-1") + PROMPT
             else:
                 answer = self._answer(text)
-                self._reply(command + b"\r" + (answer.encode() + b"\r" if answer else b"") + PROMPT)
+                self._reply((f"{text}\r" + (f"{answer}\r" if answer else "")).encode("latin-1") + PROMPT)
 
     def _turn(self, position: int) -> None:
         steps = abs(position - self._position)

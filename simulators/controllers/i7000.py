@@ -3,6 +3,7 @@
 from drivers.sources.i7000 import Config
 from simulators.clock import FastClock
 from simulators.serial.emulator import Emulator
+from simulators.serial.line_collector import LineCollector
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
 
@@ -21,7 +22,7 @@ class I7060Emulator(Emulator):
         self._watchdog_s: float | None = None
         self._status = 0
         self._heard_s = clock.now_s()
-        self._buffer = bytearray()
+        self._lines = LineCollector(b"\r")
 
     def light_at(self, wavelength_nm: float) -> float:
         """1 or 0: a relay knows no colour."""
@@ -35,10 +36,8 @@ class I7060Emulator(Emulator):
             self._status, self._outputs, self._watchdog_s = RUN_OUT, 0, None
 
     def _do_receive(self, data: bytes) -> None:
-        self._buffer += data
-        while (end := self._buffer.find(b"\r")) >= 0:
-            command = bytes(self._buffer[:end]).decode("ascii", "replace").strip("\n")
-            del self._buffer[: end + 1]
+        for line in self._lines.lines(data):
+            command = line.strip("\n")
             self._look()
             if command == "~**":
                 self._heard_s = self.clock.now_s()

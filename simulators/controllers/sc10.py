@@ -5,6 +5,7 @@ import re
 from drivers.sources.sc10 import Config
 from simulators.clock import FastClock
 from simulators.serial.emulator import Emulator
+from simulators.serial.line_collector import LineCollector
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
 
@@ -33,7 +34,7 @@ class SC10Emulator(Emulator):
         self._stuck: bool | None = None
         # Times in milliseconds, repeats, trigger and speed of the line: kept, and without effect here.
         self._numbers = {"open": 1000, "shut": 1000, "rep": 1, "trig": 0, "baud": 0, "xto": 0}
-        self._buffer = bytearray()
+        self._lines = LineCollector(b"\r")
 
     def is_open(self) -> bool:
         """True if light passes now."""
@@ -65,14 +66,12 @@ class SC10Emulator(Emulator):
             self._stuck = self._blade_open()
 
     def _do_receive(self, data: bytes) -> None:
-        self._buffer += data
-        while (end := self._buffer.find(b"\r")) >= 0:
-            command = bytes(self._buffer[:end]).strip(b"\n")
-            del self._buffer[: end + 1]
+        for line in self._lines.lines(data):
+            command = line.strip("\n")
             self._apply_faults()
             self._stick(bool(self.faults.active.keys() & {"stuck", "jammed"}))
-            answer = self._answer(command.decode("ascii", "replace"))
-            self._reply(command + b"\r" + (answer.encode() + b"\r" if answer else b"") + PROMPT)
+            answer = self._answer(command)
+            self._reply((f"{command}\r" + (f"{answer}\r" if answer else "")).encode("latin-1") + PROMPT)
 
     def _answer(self, command: str) -> str:
         match command.lower():

@@ -93,10 +93,10 @@ class SMC100Controller:
             "TB": lambda letter: f"{letter or self.error} {ERROR_TEXTS.get(letter or self.error, 'Unknown')}",
             "TP": lambda _: f"{self.axis.position_deg():.5f}",
             "TH": lambda _: f"{self.target_deg:.5f}",
-            "SL": self._left_limit,
-            "SR": self._right_limit,
-            "VA": self._velocity,
-            "AC": self._acceleration,
+            "SL": lambda text: self._setting(text, "min_deg", -1e6, 0.0),
+            "SR": lambda text: self._setting(text, "max_deg", 0.0, 1e6),
+            "VA": lambda text: self._setting(text, "speed_deg_s", 1e-6, 1e4),
+            "AC": lambda text: self._setting(text, "acceleration_deg_s2", 1e-6, 1e6),
             "PA": self._absolute,
             "PR": self._relative,
             "PT": self._move_time,
@@ -123,16 +123,17 @@ class SMC100Controller:
         error, self.error = self.error, "@"
         return error
 
-    def _setting(self, value: str, now: float | None, low: float, high: float) -> tuple[str | None, float]:
-        """Answer a question or return the new value of a setting."""
+    def _setting(self, value: str, name: str, low: float, high: float) -> str | None:
+        """Answer a question, or change an attribute of the axis."""
         if value == "?":
-            return f"{now:g}", 0.0
+            return f"{getattr(self.axis, name):g}"
         new = _number(value)
         if not low <= new <= high:
             raise Smc100Error("C")
         if self.state() in (0x1E, 0x28):
             raise Smc100Error("L" if self.state() == 0x1E else "M")
-        return None, new
+        setattr(self.axis, name, new)
+        return None
 
     def _keep(self, letters: str, value: str) -> str | None:
         if value == "?":
@@ -151,30 +152,6 @@ class SMC100Controller:
             raise Smc100Error("D")
         self.configuring = value == "1"
         return None
-
-    def _left_limit(self, value: str) -> str | None:
-        answer, new = self._setting(value, self.axis.min_deg, -1e6, 0.0)
-        if answer is None:
-            self.axis.min_deg = new
-        return answer
-
-    def _right_limit(self, value: str) -> str | None:
-        answer, new = self._setting(value, self.axis.max_deg, 0.0, 1e6)
-        if answer is None:
-            self.axis.max_deg = new
-        return answer
-
-    def _velocity(self, value: str) -> str | None:
-        answer, new = self._setting(value, self.axis.speed_deg_s, 1e-6, 1e4)
-        if answer is None:
-            self.axis.speed_deg_s = new
-        return answer
-
-    def _acceleration(self, value: str) -> str | None:
-        answer, new = self._setting(value, self.axis.acceleration_deg_s2, 1e-6, 1e6)
-        if answer is None:
-            self.axis.acceleration_deg_s2 = new
-        return answer
 
     def _refuse_unless_ready(self) -> None:
         state = self.state()

@@ -148,10 +148,8 @@ class ZaberDevice:
             axis.max_deg = value / self.per_deg
         elif name == "comm.alert" and value in (0, 1):
             self.settings[name] = str(value)
-        elif name in self._readable():
-            raise Rejected("BADDATA" if name in ("maxspeed", "accel") else "BADCOMMAND")
         else:
-            raise Rejected("BADCOMMAND")
+            raise Rejected("BADDATA" if name in ("maxspeed", "accel") else "BADCOMMAND")
         return "0"
 
     def _move(self, arguments: list[str]) -> str:

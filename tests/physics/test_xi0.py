@@ -104,7 +104,7 @@ def test_a_model_turned_by_45_degrees_gives_a_quarter_and_beyond_is_kept_and_fla
     m0 = mueller.rotation(turns) @ true @ mueller.rotation(-turns)
     p = measured(np.broadcast_to(triply_degenerate.mueller_matrix(true, 0.7), m0.shape), w)
     e = estimate(p, np.full_like(p, 1e-10), w, m0)
-    alpha_0 = triply_degenerate.coefficients(e.xi0, e.m00)[0]
+    alpha_0 = e.m00 * (4 * e.xi0 - 1) / 3
     np.testing.assert_allclose(alpha_0 / alpha_0[0], np.cos(2 * turns), atol=1e-12)
     assert e.xi0[2] == pytest.approx(0.25)
     assert e.unphysical.tolist() == [False, False, False, True, True]
@@ -166,12 +166,3 @@ def test_shapes_that_do_not_fit_are_refused(red):
         estimate(np.ones((4, 3)), None, np.ones((40, 16)), m0)
     with pytest.raises(ValueError, match="weights need"):
         estimate(np.ones((4, 3)), None, np.ones((4, 16)), m0, weighted=True)
-
-
-def test_td_coefficients_and_back():
-    xi0, m00 = np.array([0.2, 0.25, 0.6, 1.0]), np.array([0.3, 1.0, 2.0, 0.5])
-    a, b = triply_degenerate.coefficients(xi0, m00)
-    np.testing.assert_allclose(((a + b / 4) / (a + b), a + b), (xi0, m00), atol=1e-14)
-    m = triply_degenerate.mueller_matrix(np.tile(np.eye(4), (4, 1, 1)), xi0, m00)
-    d = np.sqrt((m**2).sum(axis=(1, 2)) - m[:, 0, 0] ** 2) / (np.sqrt(3) * m[:, 0, 0])
-    np.testing.assert_allclose(triply_degenerate.depolarization_index(xi0), d, atol=1e-14)

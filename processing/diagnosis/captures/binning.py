@@ -4,8 +4,6 @@ Pixels next to each other say the same of an instrument: a mean over them keeps 
 takes a fraction of the time. What needs pixels one by one (hits, bad pixels, the noise of the detector) comes before.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

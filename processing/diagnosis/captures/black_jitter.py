@@ -1,7 +1,5 @@
 """A black level that is another one in every frame, from pixels that hardly see light."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

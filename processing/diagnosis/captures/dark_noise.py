@@ -1,7 +1,5 @@
 """Noise of the dark frames, which all states of a pixel share."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -5,8 +5,6 @@ then have twice the variance of the noise, whatever the instrument does. How tha
 light distinguishes the kinds of noise.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 Only one frame is in memory as stored, so a large sensor takes no more memory than what is kept of it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -4,8 +4,6 @@ Source: Widrow and Kollar, Quantization Noise, Cambridge 2008, chapter 4. The me
 of the numbers unless their spread is above about half a step.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, TypeAlias
 

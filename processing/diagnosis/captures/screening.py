@@ -5,8 +5,6 @@ pixels cannot be interpolated, and the spline rings for some pixels around it. W
 moved by half a pixel and back. A steep slope that is smooth loses nothing: it shows a shift best.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -5,8 +5,6 @@ is both coefficients, are free at every pixel and projected out, exactly as a fr
 `InstrumentProblem`: what is left tests the dominant process alone. Derivatives as there (Kaufman).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """psi and |D| of the dominant process and xi0 by a model of the reflectance, and what a correction does to xi0."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from processing.arrays import Array

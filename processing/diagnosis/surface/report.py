@@ -1,7 +1,5 @@
 """Figures and facts about each capture in the report of `diagnose --reflectance`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

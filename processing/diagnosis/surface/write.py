@@ -1,7 +1,5 @@
 """Write what `diagnose --reflectance` found: a material, a geometry, an instrument file, each only if it changed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
