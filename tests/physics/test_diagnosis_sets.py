@@ -53,6 +53,29 @@ def test_probabilities_are_those_of_all_sets():
     assert posterior.any_of([0, 1]) > 0.99
 
 
+def test_where_the_noise_is_unknown_it_is_one_of_the_unknowns():
+    """In the noise that the likeliest set leaves, all that is absent would look too unlikely, and it too certain."""
+    random = np.random.default_rng(11)
+    design = random.standard_normal((12, 2)) * 5
+    data = 20 * (design @ np.array([0.25, -0.2]) + random.standard_normal(12))
+    problem = Quadratic(float(data @ data), -20 * design.T @ data, 400 * design.T @ design)
+    sets = Sets(problem, groups(1, 1), Noise(is_known=False, directions=12.0, floor=1e-3))
+    states = [State(np.array(tau), u) for tau in product([0.0, *TAU], repeat=2) for u in np.geomspace(20, 2e4, 30)]
+    scores = np.array([sets.score(state) for state in states])
+    weight = np.exp(scores - scores.max())
+    weight /= weight.sum()
+    exact = weight @ np.array([state.tau > 0 for state in states])
+    assert np.all((exact > 0.2) & (exact < 0.98))
+    samples = stay(sets, likely_starts(sets, likely_set(sets)), 3000)
+    assert samples.probability == pytest.approx(exact, abs=0.05)
+    second = np.zeros(2)
+    for w, state in zip(weight, states, strict=True):
+        if w > 1e-6:
+            fit = sets.fitted(state)
+            second[fit.active] += w * (np.diag(fit.covariance) + fit.mean**2)
+    assert np.diag(samples.covariance) + samples.mean**2 == pytest.approx(second, rel=0.1)
+
+
 def test_one_cause_that_does_what_two_do_has_its_share_from_either_side():
     """Between them lies a set of all three, or one that leaves half of the data: no chain passes that."""
     half = 60 * np.random.default_rng(5).standard_normal((90, 4))

@@ -63,6 +63,10 @@ def swap_groups(sets: Sets, state: State) -> Iterator[State]:
             yield alternative
 
 
+def _key(state: State) -> bytes:
+    return np.append(state.unit, state.tau).tobytes()
+
+
 class _ByStay:
     """Every state that was visited counts by how long the chains stay there."""
 
@@ -74,7 +78,7 @@ class _ByStay:
 
     def conditional(self, state: State) -> tuple[Conditional, Array]:
         """Conditional posterior of every group given the others, and the probability (G,) of each."""
-        key = state.tau.tobytes()
+        key = _key(state)
         if key not in self._known:
             c = self._sets.conditional(state)
             self._known[key] = c, chance_of(self._sets, c)
@@ -92,14 +96,26 @@ class _ByStay:
             at = np.argmin(np.abs(np.append(0.0, sets.taus)[:, None] - state.tau), axis=0)
             rate[np.arange(at.size), at] = 0.0
             rate[~sets.free] = 0.0
-            key, total = state.tau.tobytes(), float(rate.sum())
+            key, total = _key(state), float(rate.sum())
             stays[key] = stays.get(key, 0.0) + 1 / max(total, 1e-12)
             if total <= 0:
                 break
             k, width = divmod(int(random.choice(rate.size, p=rate.ravel() / total)), rate.shape[1])
             state.tau[k] = sets.taus[width - 1] if width else 0.0
+            self._change_unit(state, random)
         for key, stay in stays.items():
             self._seen[key] = self._seen.get(key, 0.0) + share * stay / sum(stays.values())
+
+    def _change_unit(self, state: State, random: np.random.Generator) -> None:
+        """A Metropolis step of the unit where the noise is not known: what explains much makes it smaller."""
+        if self._sets.noise.is_known:
+            return
+        spread = np.sqrt(2 / self._sets.noise.directions)
+        new = State(state.tau, state.unit * float(np.exp(spread * random.normal())))
+        if new.unit < self._sets.noise.floor:
+            return
+        if np.log(random.random()) < self._sets.score(new) - self._sets.score(state):
+            state.unit = new.unit
 
     def moments(self) -> tuple[Array, Array, Array]:
         """Probability (G,) of each group; mean (K,) and covariance (K, K) of the parameters."""
@@ -117,19 +133,19 @@ class _ByStay:
         """Groups (S, G) of each set, and the weight (S,) of the set."""
         weight: dict[bytes, float] = {}
         for key, share in self._seen.items():
-            inclusion = (np.frombuffer(key) > 0).tobytes()
+            inclusion = (np.frombuffer(key)[1:] > 0).tobytes()
             weight[inclusion] = weight.get(inclusion, 0.0) + share
         sets = np.array([np.frombuffer(key, dtype=bool) for key in weight]).reshape(len(weight), -1)
         return sets, np.array(list(weight.values())) / sum(weight.values())
 
 
 def stay(sets: Sets, starts: Iterable[tuple[State, float]], changes: int) -> Samples:
-    """Average over sets, from likely ones on, each with its share of the changes; their unit of chi-square stays."""
+    """Average over sets, from likely ones on, each with its share of the changes."""
     random, average = np.random.default_rng(0), _ByStay(sets)
     for start, share in starts:
         average.visit(start, share, max(1, round(changes * share)), random)
     assert average.best is not None
-    return Samples(*average.moments(), *average.inclusion(), average.best[1])
+    return Samples(*average.moments(), *average.inclusion(), sets.settled(average.best[1]))
 
 
 def likely_starts(sets: Sets, state: State) -> list[tuple[State, float]]:
@@ -142,7 +158,7 @@ def likely_starts(sets: Sets, state: State) -> list[tuple[State, float]]:
     instead = (climb(sets, sets.without(state, int(k)), without=int(k)) for k in indices)
     several = (State(s.tau, state.unit) for s in instead)
     states = {s.tau.tobytes(): s for s in (state, *swap_groups(sets, state), *several)}.values()
-    score = np.array([sets.score(s) for s in states])
+    score = np.array([sets.score(sets.settled(s)) for s in states])
     share = np.exp(score - score.max())
     share /= share.sum()
     starts = [(s, float(w)) for s, w in zip(states, share, strict=True) if w > SHARES]

@@ -85,14 +85,13 @@ class Noise:
         beyond = self.directions + np.maximum(excess - self.slack, 0.0) if self.is_known else excess
         return np.maximum(beyond / self.directions, self.floor)
 
-    def log_likelihood(self, excess: Any) -> Any:
-        """Log of the likelihood with the most likely unit."""
-        spread, within = excess, 0.0
+    def log_likelihood(self, excess: Any, unit: Any = None) -> Any:
+        """Log of the likelihood of a fit with a unit, by default the most likely one."""
+        unit, spread, within = self.unit(excess) if unit is None else unit, excess, 0.0
         if self.is_known:
             # Within the noise differences count in full.
             spread = self.directions + np.maximum(excess - self.slack, 0.0)
             within = np.minimum(excess - self.slack, 0.0)
-        unit = self.unit(excess)
         return -0.5 * (self.directions * np.log(unit) + spread / unit + within)
 
 
@@ -112,7 +111,7 @@ class State:
 class SetFit:
     """Posterior of the parameters of one set: which `active` (A,), mean (A,), covariance (A, A), and how likely.
 
-    `excess` is that of the fit (the cost of the prior included), `score` the log probability of the set.
+    `excess` is that of the fit (the cost of the prior included), `score` the log probability of the set with its unit.
     """
 
     active: NDArray[np.int64]
@@ -199,7 +198,7 @@ class Sets:
         return self._solved(state)[0]
 
     def score(self, state: State) -> float:
-        """Log probability of a set."""
+        """Log probability of a set with its unit."""
         return self._factored(state)[-1]
 
     def _excess(self, state: State) -> float:
@@ -216,7 +215,7 @@ class Sets:
         excess = self.form.excess - u * float(right @ right)
         # What the width of the prior costs: log det (I + T H / u).
         width = 2 * float(np.log(np.diag(lower)).sum()) - float(np.log(prior).sum())
-        score = self.noise.log_likelihood(excess) - 0.5 * width + self._log_prior(state.tau)
+        score = self.noise.log_likelihood(excess, u) - 0.5 * width + self._log_prior(state.tau)
         return active, lower, right, excess, score
 
     def _solved(self, state: State) -> tuple[SetFit, Array, Array]:
