@@ -62,22 +62,23 @@ def parts_of(model: InstrumentModel, seed: int) -> list[KnownCapture]:
 
 @pytest.fixture(scope="module")
 def repeated():
-    """Fits with curves and with a value at each wavelength, of the same noisy captures."""
+    """Noisy captures, and fits with curves of them."""
     captures = [parts_of(plates(), seed) for seed in range(5)]
-    return [(fit_curves(parts, FREE, 3), fit_trains(parts, FREE)) for parts in captures]
+    return [(parts, fit_curves(parts, FREE, 3)) for parts in captures]
 
 
 @pytest.mark.long
 def test_curves_have_smaller_errors_than_values_at_each_wavelength(repeated):
     truth = np.array([true_values(nm) for nm in ELECTRONS])
-    smooth = np.array([[c.values for c in curves.calibrations] for curves, _ in repeated]) - truth
-    separate = np.array([[c.values for c in each] for _, each in repeated]) - truth
+    separately = [fit_trains(parts, FREE) for parts, _ in repeated]
+    smooth = np.array([[c.values for c in curves.calibrations] for _, curves in repeated]) - truth
+    separate = np.array([[c.values for c in each] for each in separately]) - truth
     plates_only = [1, 3]
-    unit = np.array([[c.stderr for c in each] for _, each in repeated])
+    unit = np.array([[c.stderr for c in each] for each in separately])
     smooth, separate = (np.mean((error / unit)[..., plates_only] ** 2) for error in (smooth, separate))
     # Three coefficients of six values: half the variance.
     assert smooth < 0.75 * separate
-    for curves, each in repeated:
+    for (_, curves), each in zip(repeated, separately, strict=True):
         for c, e in zip(curves.calibrations, each, strict=True):
             assert np.all(c.stderr[plates_only] < e.stderr[plates_only])
 
@@ -85,19 +86,19 @@ def test_curves_have_smaller_errors_than_values_at_each_wavelength(repeated):
 def test_error_bars_of_curves_are_those_of_the_noise(repeated):
     truth = np.array([true_values(nm) for nm in ELECTRONS])
     pulls = np.array(
-        [[(c.values - t) / c.stderr for c, t in zip(f.calibrations, truth, strict=True)] for f, _ in repeated]
+        [[(c.values - t) / c.stderr for c, t in zip(f.calibrations, truth, strict=True)] for _, f in repeated]
     )
     between = [
         (f.at(plates(), HELD_OUT_NM).values - true_values(HELD_OUT_NM)) / f.at(plates(), HELD_OUT_NM).stderr
-        for f, _ in repeated
+        for _, f in repeated
     ]
     # Five times eight independent numbers, and half as many between them.
     assert 0.7 < np.sqrt(np.mean(pulls**2)) < 1.3
     assert 0.5 < np.sqrt(np.mean(np.square(between))) < 1.5
-    assert all(f.chance > 1e-3 for f, _ in repeated)
+    assert all(f.chance > 1e-3 for _, f in repeated)
 
 
-def test_a_curve_too_stiff_is_told(repeated):
+def test_a_curve_too_stiff_is_told():
     stiff = fit_curves(parts_of(plates(), 0), FREE, 1)
     assert stiff.chance < 1e-6
     assert stiff.residual_over_mean > stiff.separate_residual

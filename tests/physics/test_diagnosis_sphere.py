@@ -99,7 +99,7 @@ def test_light_from_the_support_is_interreflection(scene, configs, tmp_path):
     assert d.verdict in ("explained", "partly_explained")
 
 
-@pytest.mark.parametrize("kind", ["not_degenerate", "slow_turn"])
+@pytest.mark.parametrize("kind", ["not_degenerate", pytest.param("slow_turn", marks=pytest.mark.long)])
 def test_what_is_not_in_the_list_gets_no_name(scene, configs, tmp_path, kind):
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     fault = drawn(kind, np.random.default_rng(4), scene, declared)

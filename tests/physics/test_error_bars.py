@@ -1,9 +1,11 @@
 """Every error bar of `process quantities` and `process xi0`: the short form of `benchmarks/error_bars.py`."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from eigenvalue_table import blocks, deviations, eigenvalues, singular_values
-from error_bars import cells, verdicts
+from error_bars import Cell, cells, verdicts
 from magnitude_table import node
 from noisy_images import nineteen_samples, noisy_image, seven_instruments
 
@@ -22,8 +24,22 @@ from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.sorted_eigenvalues import OF_MEAN, of_gaps, of_singular_values
 
 PIXELS = 300
+NOTHING_POLARIZED = ("ideal depolarizer", "nearly ideal depolarizer", "air")
 #: Three standard deviations of a part of PIXELS, below the limits of docs/studies/error-bars.md.
 LEAST_68, LEAST_95 = 0.64 - 3 * np.sqrt(0.68 * 0.32 / PIXELS), 0.93 - 3 * np.sqrt(0.95 * 0.05 / PIXELS)
+
+
+@cache
+def shared_cells(
+    instrument: str,
+    darks: int,
+    electrons: float,
+    pixels: int,
+    samples: tuple[str, ...] = (),
+    extra: tuple[str, ...] = (),
+) -> list[Cell]:
+    """Cells of several tests, each of which looks at one quantity."""
+    return list(cells(instrument, darks, electrons, pixels, samples=samples, extra=extra))
 
 
 @pytest.mark.parametrize(("electrons", "darks"), [(200, 0), (2000, 1), (20_000, 4)])
@@ -41,10 +57,7 @@ def test_every_interval_covers_for_every_sample(electrons: float, darks: int) ->
 
 @pytest.mark.parametrize("name", ["diattenuation", "polarizance_purity", "depolarization_index", "mueller"])
 def test_where_nothing_is_polarized_intervals_hold_as_often_as_they_claim(name: str) -> None:
-    table = cells(
-        "RGB950's 40", 0, 200, 1500, samples=["ideal depolarizer", "nearly ideal depolarizer", "air"], extra=()
-    )
-    for cell in table:
+    for cell in shared_cells("RGB950's 40", 0, 200, 1500, NOTHING_POLARIZED):
         if cell.quantity == name:
             # The noise of the 15 elements is not quite alike in all directions, which the interval does not know.
             assert 0.63 < cell.in_68 < 0.76, cell
@@ -52,11 +65,8 @@ def test_where_nothing_is_polarized_intervals_hold_as_often_as_they_claim(name: 
 
 
 def test_depolarization_power_of_a_depolarizer_has_no_bias() -> None:
-    cell = next(
-        c
-        for c in cells("RGB950's 40", 0, 200, 1500, samples=["ideal depolarizer"], extra=())
-        if c.quantity == "depolarization_power"
-    )
+    table = shared_cells("RGB950's 40", 0, 200, 1500, NOTHING_POLARIZED)
+    (cell,) = (c for c in table if (c.quantity, c.sample) == ("depolarization_power", "ideal depolarizer"))
     # Its 95 % interval covered 28 %, and the mean pull was -2.35.
     assert cell.in_95 > 0.93
     assert abs(cell.mean) < 1
@@ -137,7 +147,7 @@ def test_intervals_of_singular_values_cover_at_every_gap(
 @pytest.mark.parametrize("quantity", ["symmetric_d1", "symmetric_d2", "symmetric_d3", "eigenvalue_deviation"])
 def test_sorted_numbers_have_intervals_and_pulls_within_the_limits(quantity: str) -> None:
     """Elements of the symmetric decomposition covered 96 to 100 %; pulls of deviations over an even error were 1.3."""
-    rows = [c for c in cells("RGB950's 40", 1, 20_000, 1000, extra=EXTRA) if c.quantity == quantity]
+    rows = [c for c in shared_cells("RGB950's 40", 1, 20_000, 1000, extra=EXTRA) if c.quantity == quantity]
     assert len(rows) >= 12
     # The table is smooth: the smaller two of three equal ones cover 97 to 99 %.
     assert sum(verdicts(c, 1000)[:2] == ("in", "in") for c in rows) >= 9
@@ -233,8 +243,8 @@ def test_a_direction_covers_at_every_length_under_any_noise(length: float, covar
 @pytest.mark.parametrize("quantity", ["diattenuation_linear", "diattenuation", "depolarization_index", "entropy"])
 def test_noise_that_differs_between_directions_is_known(quantity: str) -> None:
     """With states of condition 80 the covariance left out m00, and 68 and 95 % intervals covered 58 and 84 to 90 %."""
-    samples = ["mirror-like", "det < 0", "DoLP 0.2", "triply degenerate"]
-    table = list(cells("24 others", 0, 20_000, 1000, samples=samples, extra=()))
+    samples = ("mirror-like", "det < 0", "DoLP 0.2", "triply degenerate")
+    table = shared_cells("24 others", 0, 20_000, 1000, samples)
     rows = [cell for cell in table if cell.quantity == quantity]
     assert len(rows) == 4
     assert min(cell.in_68 for cell in rows) > 0.6
