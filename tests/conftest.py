@@ -193,11 +193,23 @@ def run_main(capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str,
 
 
 @pytest.fixture
-def acquire(run_main: Callable[..., tuple[int, str, str]]) -> Any:
-    """Runs `acquire`, as `run_main` does; a thread of it may fail with a traceback."""
+def figures() -> None:
+    """For tests of which `acquire` shall draw the figure of a capture."""
+
+
+@pytest.fixture
+def acquire(
+    run_main: Callable[..., tuple[int, str, str]], request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Any:
+    """Runs `acquire`, as `run_main` does; a thread of it may fail with a traceback.
+
+    Half of the processor time of a small capture goes into its figure: only tests with `figures` draw it.
+    """
     from acquisition.commands.application import main
     from tests.commands import Program
 
+    if "figures" not in request.fixturenames:
+        monkeypatch.setattr("acquisition.screen.quicklook.draw", lambda path: path.with_suffix(".png"))
     return Program(partial(run_main, main, traceback=True))
 
 

@@ -1,5 +1,7 @@
 """`acquire` takes whole captures on emulated devices through the real drivers."""
 
+from pathlib import Path
+
 import h5py
 import numpy as np
 import pytest
@@ -8,10 +10,10 @@ from processing.storage.captures.capture import Capture
 from simulators.camera.pixel_stamp import read_stamp
 from tests.commands import exit_code
 
+pytestmark = pytest.mark.usefixtures("figures")
 
-def _path(out: str):
-    from pathlib import Path
 
+def _path(out: str) -> Path:
     lines = [line.split() for line in out.splitlines()]
     return next(Path(words[1]) for words in lines if words and words[0] == "capture")
 

@@ -65,12 +65,17 @@ def test_report_is_self_contained(campaign: Path, capsys: pytest.CaptureFixture[
     assert re.search(r"uncertainty budget of depolarization_index = (1\.000|0\.999)\d*", text)
     assert "noise of light and camera" in text
     assert "U95 = " in text
-    # The same command again makes it anew; another report is not replaced.
-    assert run(capsys, "report", campaign, "--out", out, "--title", "Air & co") == (0, "")
-    code, err = run(capsys, "report", campaign, "--out", out)
+
+
+def test_the_same_command_makes_a_report_anew_and_another_does_not_replace_it(tmp_path: Path, capsys) -> None:
+    (tmp_path / "rmsd.csv").write_text("omega_deg,psi_deg\n10,1.5\n20,2.5\n", encoding="utf-8")
+    out = tmp_path / "report.html"
+    assert run(capsys, "report", tmp_path, "--out", out, "--title", "Air & co") == (0, "")
+    assert run(capsys, "report", tmp_path, "--out", out, "--title", "Air & co") == (0, "")
+    code, err = run(capsys, "report", tmp_path, "--out", out)
     assert code == 2
     assert "exists" in err
-    assert run(capsys, "report", campaign / "rmsd.csv", "--out", out, "--overwrite")[0] == 0
+    assert run(capsys, "report", tmp_path / "rmsd.csv", "--out", out, "--overwrite")[0] == 0
 
 
 @pytest.mark.long

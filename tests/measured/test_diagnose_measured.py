@@ -156,7 +156,10 @@ def test_ten_wavelengths_share_their_mechanics(public_files, configs, tmp_path):
 
 
 # One row of the table has a noise of 0.75, 0.81 and 1.20 %; a mean of eleven (20 nm) has a third of it.
-@pytest.mark.parametrize(("wavelength_nm", "before", "after"), [(450, 1.5, 0.6), (850, 0.8, 0.55), (1000, 2.0, 1.2)])
+@pytest.mark.parametrize(
+    ("wavelength_nm", "before", "after"),
+    [pytest.param(450, 1.5, 0.6, marks=pytest.mark.long), (850, 0.8, 0.55), (1000, 2.0, 1.2)],
+)
 def test_one_detector_behind_two_plates(public_files, configs, tmp_path, wavelength_nm, before, after):
     instrument = configs / "instruments/drr_single_detector.yaml"
     path = one_detector(public_files, tmp_path, instrument, wavelength_nm, 5)
