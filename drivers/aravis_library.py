@@ -94,7 +94,7 @@ def open_camera(name: str, device: str | None, aravis: Any, glib_error: Any) -> 
     link = camera.get_device()
     if isinstance(link, aravis.GvDevice) and not _control(link, glib_error):
         raise CameraBusy(
-            f"open camera {name} ({key})",
+            f"open camera {name!r}, device {key}",
             f"{_holder(link, glib_error)} controls it already",
             f"It was asked for {_FREES_ITSELF_S:.0f} s, in which a camera frees itself after a crash. "
             "Close the other program",
@@ -113,7 +113,7 @@ def _find(name: str, device: str | None, aravis: Any) -> str:
 def _not_found(name: str, device: str | None, cameras: list[dict[str, str]], detail: str) -> CameraNotFound:
     listing = ", ".join(f"{c['id']} (serial {c['serial_number']}, at {c['address']})" for c in cameras) or "no camera"
     return CameraNotFound(
-        f"open camera {name} ({device or 'the only one'})",
+        f"open camera {name!r}" + (f", device {device}" if device else ""),
         f"found {listing}" + (f"; {detail}" if detail else ""),
         "Check power and cable, and that the interface is in the camera's subnet"
         if not cameras
