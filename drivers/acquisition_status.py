@@ -16,10 +16,8 @@ class AcquisitionStatus:
 
     Attributes
     ----------
-    tells_exposing : bool
-        True if the camera tells when an exposure has ended.
-    tells_armed : bool
-        True if it tells when it would heed a trigger.
+    tells_exposing : True if the camera tells when an exposure has ended.
+    tells_armed : True if it tells when it would heed a trigger.
     """
 
     def __init__(self, features: Features | None) -> None:

@@ -29,12 +29,9 @@ class AgreeingReadings:
 
         Parameters
         ----------
-        request : str
-            Name of the reading, for the error.
-        read, is_moving : callable
-            Ask the device.
-        tolerance : float
-            By how much readings of a servo at rest may tremble.
+        request : name of the reading, for the error.
+        read, is_moving : ask the device.
+        tolerance : by how much readings of a servo at rest may tremble.
 
         Raises
         ------

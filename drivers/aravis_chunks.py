@@ -21,13 +21,11 @@ class ChunkStamps:
 
     Parameters
     ----------
-    name : str
-        Name of the camera in messages.
+    name : name of the camera in messages.
     camera : the open `Aravis.Camera`.
     features : of that camera.
     glib_error : GLib's exception class.
-    wanted : bool
-        False leaves the camera as it is.
+    wanted : False leaves the camera as it is.
     """
 
     def __init__(self, name: str, camera: Any, features: Features, glib_error: Any, *, wanted: bool) -> None:

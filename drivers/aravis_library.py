@@ -70,10 +70,8 @@ def open_camera(name: str, device: str | None, aravis: Any, glib_error: Any) -> 
 
     Parameters
     ----------
-    name : str
-        Name of the camera in messages.
-    device : str or None
-        None takes the only camera there is.
+    name : name of the camera in messages.
+    device : None takes the only camera there is.
 
     Returns
     -------

@@ -42,16 +42,11 @@ class Setup:
 
     Attributes
     ----------
-    interface : tuple of str and int, or None
-        Name and MTU of the network interface that leads to the camera.
-    exposure_s : float
-        Exposure as read back.
-    size : tuple of int
-        Width and height of a frame as read back.
-    hardware : bool
-        True if an input line triggers.
-    status : AcquisitionStatus
-        What the camera tells of its trigger and its exposure.
+    interface : name and MTU of the network interface that leads to the camera.
+    exposure_s : exposure as read back.
+    size : width and height of a frame as read back.
+    hardware : True if an input line triggers.
+    status : what the camera tells of its trigger and its exposure.
     """
 
     def __init__(self, name: str, config: Config, aravis: Any, camera: Any, *, features: Features) -> None:

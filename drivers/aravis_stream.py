@@ -53,12 +53,9 @@ class FrameStream:
     ----------
     aravis, camera :
         The Aravis module and an open `Aravis.Camera`.
-    payload_bytes : int
-        Size of one frame.
-    buffers : int
-        Number of frames in flight.
-    resend : bool
-        Ask a GigE Vision camera for missing packets again.
+    payload_bytes : size of one frame.
+    buffers : number of frames in flight.
+    resend : ask a GigE Vision camera for missing packets again.
     """
 
     def __init__(self, aravis: Any, camera: Any, payload_bytes: int, buffers: int, *, resend: bool) -> None:

@@ -52,14 +52,10 @@ class StreamStatistics:
 
     Attributes
     ----------
-    completed, failures, underruns : int
-        Buffers that the transport filled whole, gave up on, or had none for.
-    missing_packets, resent_packets : int
-        Packets that never came, and packets that came on request.
-    retakes : int
-        Exposures repeated because their frame was lost.
-    stale_discarded : int
-        Whole frames thrown away because they belong to no exposure asked for.
+    completed, failures, underruns : buffers that the transport filled whole, gave up on, or had none for.
+    missing_packets, resent_packets : packets that never came, and packets that came on request.
+    retakes : exposures repeated because their frame was lost.
+    stale_discarded : whole frames thrown away because they belong to no exposure asked for.
     """
 
     completed: int = 0

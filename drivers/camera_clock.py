@@ -44,12 +44,9 @@ class CameraClock:
 
         Parameters
         ----------
-        camera_time_ns : int
-            The camera's stamp of the frame, from any zero; 0 if it has none.
-        first_packet_s : float
-            Unix time at which the host saw the first packet.
-        exposure_s : float
-            Exposure time of the frame.
+        camera_time_ns : the camera's stamp of the frame, from any zero; 0 if it has none.
+        first_packet_s : Unix time at which the host saw the first packet.
+        exposure_s : exposure time of the frame.
 
         Returns
         -------

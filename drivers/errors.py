@@ -74,18 +74,12 @@ class MotionFailed(DeviceError):
 
     Parameters
     ----------
-    axis : str
-        Name of the axis.
-    target_deg : float or None
-        Target in user degrees, None for homing.
-    last_deg : float or None
-        Last position that was read, in user degrees; None if none could be read.
-    elapsed_s, allowed_s : float
-        Time since the start of the motion and the time it was given.
-    why : str
-        Observation: stalled, silent, fault flag, wrong end position.
-    unit : str
-        Of target and position; "V" for a liquid crystal.
+    axis : name of the axis.
+    target_deg : target in user degrees, None for homing.
+    last_deg : last position that was read, in user degrees; None if none could be read.
+    elapsed_s, allowed_s : time since the start of the motion and the time it was given.
+    why : observation: stalled, silent, fault flag, wrong end position.
+    unit : of target and position; "V" for a liquid crystal.
     """
 
     def __init__(

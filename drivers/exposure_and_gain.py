@@ -55,12 +55,10 @@ class ExposureAndGain:
 
     Parameters
     ----------
-    name : str
-        Name of the camera in messages.
+    name : name of the camera in messages.
     gain_unit : {"dB", "factor"} or None
         Unit of Gain from the rig file; None takes the one that the camera's description has.
-    raw_per_db : float or None
-        Steps of GainRaw for a decibel, for cameras without Gain.
+    raw_per_db : steps of GainRaw for a decibel, for cameras without Gain.
     """
 
     def __init__(

@@ -32,8 +32,7 @@ class Features:
 
     Parameters
     ----------
-    name : str
-        Name of the camera in messages.
+    name : name of the camera in messages.
     aravis, glib_error :
         The Aravis module and GLib's exception class, which are imported late.
     camera :
@@ -110,12 +109,9 @@ class Features:
 
         Parameters
         ----------
-        names : tuple of str
-            Names to look for, the standard one first.
-        value : float
-            Rounded for a feature of whole numbers.
-        floor : float
-            Largest harmless difference where the feature states no step of its own.
+        names : names to look for, the standard one first.
+        value : rounded for a feature of whole numbers.
+        floor : largest harmless difference where the feature states no step of its own.
 
         Raises
         ------

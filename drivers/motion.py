@@ -39,12 +39,9 @@ class Motion:
 
     Attributes
     ----------
-    target_deg : float or None
-        Target in user degrees; None for homing.
-    expected_s, allowed_s : float
-        Duration computed from distance, speed and acceleration, and the deadline.
-    start : Position or None
-        Where a move begins, as read before it; None for homing.
+    target_deg : target in user degrees; None for homing.
+    expected_s, allowed_s : duration computed from distance, speed and acceleration, and the deadline.
+    start : where a move begins, as read before it; None for homing.
     """
 
     def __init__(self, axis: "MotionAxis", target_deg: float | None, expected_s: float, allowed_s: float) -> None:

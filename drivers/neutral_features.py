@@ -47,14 +47,12 @@ class Rule:
 
     Attributes
     ----------
-    names : str
-        Regular expression for the whole name without underscores, in any case of its letters.
+    names : regular expression for the whole name without underscores, in any case of its letters.
     neutral : {"off", "least", "one", "unity"} or tuple of str
         Off: false, an entry that means off, or zero; least: the lower limit; one: a count of 1; unity: a factor of 1,
         which is not known where it is a whole number of other parts; else the entries that will do.
-    harm : bool
-        True where the counts or the time of the exposure are wrong as long as it is set: no capture is taken then, also
-        where its neutral value is not known.
+    harm : True where the counts or the time of the exposure are wrong as long as it is set: no capture is taken then,
+        also where its neutral value is not known.
     """
 
     names: str
@@ -167,19 +165,15 @@ class NeutralFeatures:
 
     Parameters
     ----------
-    name : str
-        Name of the camera in messages.
-    features : Features
-        Those of the open camera; its acquisition is stopped.
-    user_set : str or None
-        The set that is loaded first; None loads none.
+    name : name of the camera in messages.
+    features : those of the open camera; its acquisition is stopped.
+    user_set : the set that is loaded first; None loads none.
     exempt : collection of str
         Features of the rig file: they are set on purpose, so no rule is applied to them.
 
     Attributes
     ----------
-    remarks : list of str
-        What could not be set, in words, for `acquire doctor` and the capture file.
+    remarks : what could not be set, in words, for `acquire doctor` and the capture file.
     """
 
     def __init__(self, name: str, features: Features, user_set: str | None, exempt: Collection[str]) -> None:

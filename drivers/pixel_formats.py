@@ -25,22 +25,16 @@ class PixelFormat:
 
     Attributes
     ----------
-    name : str
-        The camera's name for it (SFNC `PixelFormat` entry).
-    code : int or None
-        32-bit PFNC code; None where it is not published: the camera's own node map then tells it.
-    bits : int
-        Bits that carry the value: 8, 10, 12, 14 or 16.
+    name : the camera's name for it (SFNC `PixelFormat` entry).
+    code : 32-bit PFNC code; None where it is not published: the camera's own node map then tells it.
+    bits : bits that carry the value: 8, 10, 12, 14 or 16.
     layout : {"plain", "p", "packed"}
         How pixels share bytes.
-    polarized : bool
-        True where the maker marks the format as that of a polarization sensor.
-    colours : str
-        Filters over the first two pixels of the first row, such as "GR"; the other two lie below them. Empty without
-        a colour filter. On a polarization sensor each colour covers a whole super-pixel.
-    angles : bool
-        True where each pixel is sent as four counts, those behind 0, 45, 90 and 135 degrees. `decode` lays them out as
-        the super-pixel of the raw mosaic, so a frame has twice as many rows and columns.
+    polarized : True where the maker marks the format as that of a polarization sensor.
+    colours : filters over the first two pixels of the first row, such as "GR"; the other two lie below them. Empty
+        without a colour filter. On a polarization sensor each colour covers a whole super-pixel.
+    angles : True where each pixel is sent as four counts, those behind 0, 45, 90 and 135 degrees. `decode` lays them
+        out as the super-pixel of the raw mosaic, so a frame has twice as many rows and columns.
     """
 
     name: str
@@ -78,10 +72,8 @@ class PixelFormat:
         ----------
         memory : ndarray of uint8
             At least `payload_bytes(width, height)` bytes; not kept.
-        width, height : int
-            Image size in pixels.
-        shift : int
-            Empty bits below the value, where a camera left-aligns its data in a wider word (Mono16).
+        width, height : image size in pixels.
+        shift : empty bits below the value, where a camera left-aligns its data in a wider word (Mono16).
 
         Returns
         -------

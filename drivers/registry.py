@@ -51,12 +51,9 @@ def open_axis(name: str, config: AxisConfig, lines: LineRegistry) -> MotionAxis:
 
     Parameters
     ----------
-    name : str
-        Name of the axis in the rig, used in messages.
-    config : AxisConfig
-        A `Config` of one of the kinds.
-    lines : LineRegistry
-        Owner of the ports of this rig.
+    name : name of the axis in the rig, used in messages.
+    config : a `Config` of one of the kinds.
+    lines : owner of the ports of this rig.
 
     Raises
     ------

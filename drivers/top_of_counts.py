@@ -21,10 +21,9 @@ class TopOfCounts:
 
     Parameters
     ----------
-    bits : int
-        Real bits of the format: no count is larger than ``2**bits - 1``.
-    converter_bits : int or None
-        Bits of the converter, where the camera tells them; counts are taken to be left-aligned until one is not.
+    bits : real bits of the format: no count is larger than ``2**bits - 1``.
+    converter_bits : bits of the converter, where the camera tells them; counts are taken to be left-aligned until one
+        is not.
 
     Examples
     --------

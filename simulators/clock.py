@@ -24,8 +24,7 @@ class PatientClock:
 
     Parameters
     ----------
-    real_s : callable
-        Real time in seconds.
+    real_s : real time in seconds.
     """
 
     def __init__(self, real_s: Callable[[], float] = time.monotonic) -> None:
@@ -94,10 +93,8 @@ class FastClock:
 
     Parameters
     ----------
-    speed : float
-        Simulated seconds per second of `base`.
-    instant : bool
-        Motions take no time at all; the clock itself runs on.
+    speed : simulated seconds per second of `base`.
+    instant : motions take no time at all; the clock itself runs on.
     base : drivers.clock.Clock
         Clock of the drivers that talk to this simulator; real time by default, for clients of any origin.
     """

@@ -67,12 +67,7 @@ class _Announcer(Observer):
 
 
 class EmulatedRig(Rig):
-    """A rig whose devices at ports `sim:NAME` are emulators of this process.
-
-    Attributes
-    ----------
-    simulation : SimulatedRig
-    """
+    """A rig whose devices at ports `sim:NAME` are emulators of this process."""
 
     def __init__(
         self, config: RigConfig, simulator: SimulatorConfig, *, with_camera: bool = True, ask: Ask | None = None

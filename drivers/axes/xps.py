@@ -156,10 +156,8 @@ class XPSAxis(MotionAxis):
 
         Parameters
         ----------
-        first_deg, last_deg : float
-            User angles of the outermost pulses.
-        step_deg : float
-            Distance of two pulses; first and last are whole steps apart.
+        first_deg, last_deg : user angles of the outermost pulses.
+        step_deg : distance of two pulses; first and last are whole steps apart.
 
         Raises
         ------

@@ -130,8 +130,7 @@ class ZaberLine(ControllerLine):
 
         Parameters
         ----------
-        repeat : bool
-            Ask a second time, after a purge, if no valid reply came. For questions only, never for a command.
+        repeat : ask a second time, after a purge, if no valid reply came. For questions only, never for a command.
 
         Raises
         ------

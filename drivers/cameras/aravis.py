@@ -45,8 +45,7 @@ def open(name: str, config: Config, clock: Clock = REAL) -> "AravisCamera":
 
     Parameters
     ----------
-    clock : Clock
-        What exposures and deadlines are counted by. Aravis' own time limits are always real time.
+    clock : what exposures and deadlines are counted by. Aravis' own time limits are always real time.
 
     Raises
     ------

@@ -26,10 +26,8 @@ class ManualSource(LightSource):
 
     Attributes
     ----------
-    ask : callable or None
-        Shows a question and returns True for yes; None without an operator.
-    yes : bool
-        True takes every answer as yes without asking (`--yes`).
+    ask : shows a question and returns True for yes; None without an operator.
+    yes : True takes every answer as yes without asking (`--yes`).
     """
 
     selects_wavelength = True

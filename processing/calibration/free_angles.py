@@ -33,12 +33,9 @@ class Goal:
 
     Attributes
     ----------
-    noise
-        Weigh each state by its shot and read noise at this light; None: equal weights.
-    jitter_deg
-        Standard deviation of every angle in every state, which acts like noise on a polarizing sample.
-    polarization
-        Rms of m_ij / m00 that the sample is expected to have, for `jitter_deg`.
+    noise : weigh each state by its shot and read noise at this light; None: equal weights.
+    jitter_deg : standard deviation of every angle in every state, which acts like noise on a polarizing sample.
+    polarization : rms of m_ij / m00 that the sample is expected to have, for `jitter_deg`.
     """
 
     noise: AssumedNoise | None = None
@@ -52,16 +49,11 @@ class FreeDesign:
 
     Attributes
     ----------
-    angles_deg
-        Axis name to (states,).
-    retardances_deg
-        Element name to retardance; those of the model where they were not free.
-    variance
-        Trace of the inverse information of what the instrument determines, for unit noise.
-    bound
-        The least that any table of as many intensities can have.
-    rank
-        Number of elements, or combinations of them, that are determined.
+    angles_deg : axis name to (states,).
+    retardances_deg : element name to retardance; those of the model where they were not free.
+    variance : trace of the inverse information of what the instrument determines, for unit noise.
+    bound : the least that any table of as many intensities can have.
+    rank : number of elements, or combinations of them, that are determined.
     """
 
     angles_deg: Mapping[str, Array]

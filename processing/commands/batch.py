@@ -45,14 +45,10 @@ def run_batch(
 
     Parameters
     ----------
-    action, unit
-        Words of the progress bar: "reducing", "rows".
-    inputs
-        Files, see `files_of`.
-    make
-        Makes the files of one input.
-    word
-        What is said of an input that is not unchanged.
+    action, unit : words of the progress bar: "reducing", "rows".
+    inputs : files, see `files_of`.
+    make : makes the files of one input.
+    word : what is said of an input that is not unchanged.
 
     Raises
     ------
@@ -108,8 +104,7 @@ def make_products(
 
     Parameters
     ----------
-    step_of
-        The step of an input, and the product that it starts from where a capture is reduced first.
+    step_of : the step of an input, and the product that it starts from where a capture is reduced first.
 
     Raises
     ------
@@ -167,10 +162,8 @@ def write_if_changed(target: Path, overwrite: bool, write: Callable[[Path], Sequ
 
     Parameters
     ----------
-    target
-        Name of the file, or the beginning of the names of several.
-    write
-        Writes the files under a name in another folder, and returns them.
+    target : name of the file, or the beginning of the names of several.
+    write : writes the files under a name in another folder, and returns them.
 
     Raises
     ------
@@ -199,11 +192,9 @@ def files_of(
 
     Parameters
     ----------
-    takes
-        Whether the command is for a file; asked of those in folders. One that cannot be read is taken as well: the
+    takes : whether the command is for a file; asked of those in folders. One that cannot be read is taken as well: the
         command then reports it.
-    text
-        What it is for, for the message where a folder holds nothing of it: "captures".
+    text : what it is for, for the message where a folder holds nothing of it: "captures".
 
     Raises
     ------

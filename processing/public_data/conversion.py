@@ -20,14 +20,10 @@ class PublicStates:
 
     Attributes
     ----------
-    name
-        Of the capture.
-    wavelength_nm
-        Of the light.
-    sample
-        "air", "mirror" or "unknown".
-    header, rows
-        Of the states file (docs/processing.md, "Data measured elsewhere").
+    name : of the capture.
+    wavelength_nm : of the light.
+    sample : "air", "mirror" or "unknown".
+    header, rows : of the states file (docs/processing.md, "Data measured elsewhere").
     """
 
     name: str

@@ -25,14 +25,10 @@ class SetFile(Section):
 
     Attributes
     ----------
-    path
-        In the source repository.
-    sha256
-        Of its content.
-    name
-        On this machine; default: the last part of `path`.
-    commit
-        If it is not that of the set.
+    path : in the source repository.
+    sha256 : of its content.
+    name : on this machine; default: the last part of `path`.
+    commit : if it is not that of the set.
     """
 
     path: str
@@ -51,18 +47,12 @@ class PublicSet(Section):
 
     Attributes
     ----------
-    title, citation, licence, doi, note
-        For people.
-    source, commit
-        GitHub repository, and the commit that the files are of.
-    instrument
-        Instrument file of `configs/instruments`; empty where no capture can be made.
-    in_repository
-        What of it `tests/data` holds, in words.
-    files, registry
-        Its files, or the name of a list of them beside the catalogue, as `sha256sum` writes it.
-    reduced
-        Files with the same numbers in a smaller form, which may be used in place of `files`.
+    title, citation, licence, doi, note : for people.
+    source, commit : GitHub repository, and the commit that the files are of.
+    instrument : instrument file of `configs/instruments`; empty where no capture can be made.
+    in_repository : what of it `tests/data` holds, in words.
+    files, registry : its files, or the name of a list of them beside the catalogue, as `sha256sum` writes it.
+    reduced : files with the same numbers in a smaller form, which may be used in place of `files`.
     """
 
     title: str
@@ -100,10 +90,8 @@ def get_files(name: str, cache: Path, progress: Progress | None = None) -> dict[
 
     Parameters
     ----------
-    name
-        Of the set.
-    cache
-        Folder for downloads; files that it holds are not downloaded again.
+    name : of the set.
+    cache : folder for downloads; files that it holds are not downloaded again.
 
     Returns
     -------

@@ -70,9 +70,8 @@ class Systematic:
 
         Parameters
         ----------
-        matrix
-            Makes of a model and its effects the measurement matrix of the capture, (states, channels, 16), and the same
-            by the unknowns of a pixel, (states, channels, K).
+        matrix : makes of a model and its effects the measurement matrix of the capture, (states, channels, 16), and the
+            same by the unknowns of a pixel, (states, channels, K).
         counts : makes of them what is corrected in the counts.
         basis : (K, R) what the instrument determines of the unknowns; they move inside of that alone.
         """

@@ -48,9 +48,8 @@ def export(
     empty : what goes into visible bins without samples: the nearest filled bin's value, or NaN (black).
     pad_wavelengths : repeat the outer wavelengths up to the 5 that the renderer reads.
     progress : called with wavelengths written and in all.
-    uncertainty
-        Add the field `u`, in the layout of M: standard uncertainty by noise and instrument together, NaN in gaps.
-        Mitsuba ignores it.
+    uncertainty : add the field `u`, in the layout of M: standard uncertainty by noise and instrument together, NaN in
+        gaps. Mitsuba ignores it.
 
     Raises
     ------

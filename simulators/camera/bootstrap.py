@@ -26,12 +26,9 @@ def boot(memory: RegisterMemory, address: str, texts: dict[str, str], xml: tuple
 
     Parameters
     ----------
-    address : str
-        Of the camera.
-    texts : dict
-        DeviceVendorName, DeviceModelName, DeviceVersion and DeviceID.
-    xml : tuple
-        Name of the description's file, its address and its length in bytes.
+    address : of the camera.
+    texts : DeviceVendorName, DeviceModelName, DeviceVersion and DeviceID.
+    xml : name of the description's file, its address and its length in bytes.
     """
     for register, value in (
         (0x0000, _VERSION),

@@ -17,12 +17,10 @@ class ExposureInfo:
     ----------
     exposure_s, gain_db, black_level :
         As the driver set them; `black_level` in counts. `gain_db` holds GainRaw on the "aravis" description.
-    frame_id : int
-        1 to 65535, then again 1.
-    width, height, offset_x, offset_y, binning, decimation : int
-        Region in pixels as they are sent, after binning and decimation.
-    reverse_x, reverse_y : bool
-        Mirrored before the region is cut out.
+    frame_id : 1 to 65535, then again 1.
+    width, height, offset_x, offset_y, binning, decimation : region in pixels as they are sent, after binning and
+        decimation.
+    reverse_x, reverse_y : mirrored before the region is cut out.
     """
 
     exposure_s: float

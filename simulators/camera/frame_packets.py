@@ -69,10 +69,8 @@ def send(
 
     Parameters
     ----------
-    register : callable
-        Value of a bootstrap register of 32 bits.
-    numbers : range, optional
-        The packets to send, by their numbers in the frame; all where it is left out.
+    register : value of a bootstrap register of 32 bits.
+    numbers : the packets to send, by their numbers in the frame; all where it is left out.
     """
     host = socket.inet_ntoa(struct.pack(">I", register(HOST_ADDRESS)))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as channel:

@@ -44,29 +44,19 @@ class GigeCamera:
 
     Parameters
     ----------
-    serial : str
-        Serial number, under 16 characters.
-    width, height : int
-        Sensor size in pixels.
-    pixel_source : callable
-        Gets an `ExposureInfo` at the start of each exposure and returns counts, uint16 of shape (height, width) of
-        that info. If it raises, no frame is sent and the error is raised when the context ends, or by `check()`.
-    description : str or Path
-        Name of a table in `node_maps/`, or a file: a table (.yaml), or a GenICam description (.xml, .zip).
-    bits : int
-        Real bits of the counts in the 16-bit format; more is an error of the pixel source.
-    lost_ratio : float
-        Part of the packets that are lost, 0 to 1; may be changed at any time.
-    address : str
-        Loopback address to occupy.
-    wait_s : float
-        How long to wait for the address if another simulated camera has it.
-    arming_s : float
-        Time after an exposure in which a trigger is ignored; None for that of the table.
-    elsewhere : bool
-        Take another loopback address of this machine at once, if there is one that no camera has.
-    complete : bool
-        False plays a camera whose features do not suffice for a capture, so that a driver can refuse it.
+    serial : serial number, under 16 characters.
+    width, height : sensor size in pixels.
+    pixel_source : gets an `ExposureInfo` at the start of each exposure and returns counts, uint16 of shape (height,
+        width) of that info. If it raises, no frame is sent and the error is raised when the context ends, or by
+        `check()`.
+    description : name of a table in `node_maps/`, or a file: a table (.yaml), or a GenICam description (.xml, .zip).
+    bits : real bits of the counts in the 16-bit format; more is an error of the pixel source.
+    lost_ratio : part of the packets that are lost, 0 to 1; may be changed at any time.
+    address : loopback address to occupy.
+    wait_s : how long to wait for the address if another simulated camera has it.
+    arming_s : time after an exposure in which a trigger is ignored; None for that of the table.
+    elsewhere : take another loopback address of this machine at once, if there is one that no camera has.
+    complete : False plays a camera whose features do not suffice for a capture, so that a driver can refuse it.
 
     Raises
     ------

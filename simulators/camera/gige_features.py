@@ -119,8 +119,7 @@ def describe(name: str, size: tuple[int, int]) -> Description:
 
     Parameters
     ----------
-    size : tuple of int
-        Width and height of the sensor in pixels, for a table.
+    size : width and height of the sensor in pixels, for a table.
 
     Raises
     ------

@@ -20,10 +20,8 @@ def stamp(pixels: NDArray[np.uint16], values: Sequence[float], bits: int = 12) -
     ----------
     pixels : ndarray of uint16
         Image, changed in place; needs ``16 * len(values) + 12`` pixels.
-    values : sequence of float
-        Up to 255 numbers; read back exactly.
-    bits : int
-        Bits of the counts, at least 5.
+    values : up to 255 numbers; read back exactly.
+    bits : bits of the counts, at least 5.
 
     Raises
     ------

@@ -65,10 +65,8 @@ class GigeTwin:
 
     Parameters
     ----------
-    show : callable
-        Its scene.
-    description : str
-        Name of a maker's feature table, of which it takes the first format with room for its counts.
+    show : its scene.
+    description : name of a maker's feature table, of which it takes the first format with room for its counts.
     """
 
     def __init__(self, show: Show, description: str = "loopback") -> None:
@@ -129,8 +127,7 @@ class CameraConformance:
 
     Attributes
     ----------
-    kind : str
-        Of the camera in a rig file.
+    kind : of the camera in a rig file.
     """
 
     kind: ClassVar[str] = ""

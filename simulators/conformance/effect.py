@@ -27,12 +27,9 @@ class EffectConformance:
 
     Attributes
     ----------
-    effect : str
-        Its kind.
-    instrument : Path
-        Instrument file in which it has a place.
-    wavelength_nm : float
-        One at which that instrument is given.
+    effect : its kind.
+    instrument : instrument file in which it has a place.
+    wavelength_nm : one at which that instrument is given.
     """
 
     effect: ClassVar[str] = ""

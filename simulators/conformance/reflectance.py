@@ -15,10 +15,8 @@ class ReflectanceConformance:
 
     Attributes
     ----------
-    material : str
-        Text of a material file of the model.
-    wavelength_nm : float
-        One at which that material is given.
+    material : text of a material file of the model.
+    wavelength_nm : one at which that material is given.
     """
 
     material: ClassVar[str] = ""

@@ -45,8 +45,7 @@ class AxisTests:
 
     Attributes
     ----------
-    emulator : str
-        As `simulate serve` calls it: a key of the `SERVES` table of the emulator's module.
+    emulator : as `simulate serve` calls it: a key of the `SERVES` table of the emulator's module.
     """
 
     emulator: ClassVar[str] = ""

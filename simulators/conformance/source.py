@@ -52,11 +52,9 @@ class SourceConformance:
 
     Attributes
     ----------
-    emulator : str
-        As `simulate serve` calls it: a key of the `SERVES` table of the emulator's module, which makes the rig entry
-        by its function `source_configs`.
-    wavelength_nm : float
-        One that the emulated source has.
+    emulator : as `simulate serve` calls it: a key of the `SERVES` table of the emulator's module, which makes the rig
+        entry by its function `source_configs`.
+    wavelength_nm : one that the emulated source has.
     """
 
     emulator: ClassVar[str] = ""

@@ -21,8 +21,7 @@ class APTModel:
 
     Attributes
     ----------
-    stage : str or None
-        What a rig file must say of the stage.
+    stage : what a rig file must say of the stage.
     """
 
     def __init__(
@@ -72,8 +71,7 @@ class APTUnit:
 
     Parameters
     ----------
-    send : callable
-        Gets the bytes that the unit sends.
+    send : gets the bytes that the unit sends.
     """
 
     def __init__(self, model: APTModel, axis: EmulatedAxis, address: int, send: Callable[[bytes], None]) -> None:

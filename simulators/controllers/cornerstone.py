@@ -20,8 +20,7 @@ class CornerstoneEmulator(Emulator):
 
     Parameters
     ----------
-    echo : bool
-        Repeats each statement, as over RS-232; over USB it does not.
+    echo : repeats each statement, as over RS-232; over USB it does not.
 
     Attributes
     ----------

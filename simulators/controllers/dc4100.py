@@ -23,13 +23,11 @@ class DC4100Emulator(Emulator):
 
     Parameters
     ----------
-    wavelengths_nm : sequence of float or None
-        LED at each of the four channels; None where none is plugged in.
+    wavelengths_nm : LED at each of the four channels; None where none is plugged in.
 
     Attributes
     ----------
-    too_hot : bool
-        Set by `overheat`; no LED can be on then.
+    too_hot : set by `overheat`; no LED can be on then.
     """
 
     foreign = b"M00223344\r\n"

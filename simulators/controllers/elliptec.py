@@ -30,13 +30,9 @@ class ElliptecModule:
 
     Attributes
     ----------
-    address : str
-        One hex digit.
-    axis : EmulatedAxis
-    serial_number : str
-        Eight digits.
-    model : int
-        14 or 18.
+    address : one hex digit.
+    serial_number : eight digits.
+    model : 14 or 18.
     """
 
     address: str

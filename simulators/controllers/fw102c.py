@@ -19,8 +19,7 @@ class FW102CEmulator(Emulator):
 
     Parameters
     ----------
-    step_s : float
-        Simulated time from one position to the next.
+    step_s : simulated time from one position to the next.
     """
 
     foreign = b"closed?\r1\r" + PROMPT

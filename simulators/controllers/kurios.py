@@ -20,8 +20,7 @@ class KuriosEmulator(Emulator):
 
     Attributes
     ----------
-    values : dict
-        Mode of output, wavelength in nm, band, status, temperature and features, by keyword.
+    values : mode of output, wavelength in nm, band, status, temperature and features, by keyword.
     """
 
     foreign = b"SS=0\r>"

@@ -32,8 +32,7 @@ class LCC25Emulator(Emulator):
 
     Attributes
     ----------
-    values : dict
-        Of all settings, by keyword.
+    values : of all settings, by keyword.
     """
 
     foreign = b"freq?\r60.0\r" + PROMPT

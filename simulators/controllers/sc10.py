@@ -17,8 +17,7 @@ class SC10Emulator(Emulator):
 
     Parameters
     ----------
-    blade_s : float
-        Simulated time that the blade takes.
+    blade_s : simulated time that the blade takes.
     """
 
     foreign = b"closed?\r1\r" + PROMPT

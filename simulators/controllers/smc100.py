@@ -38,12 +38,8 @@ class SMC100Controller:
 
     Attributes
     ----------
-    address : int
-    axis : EmulatedAxis
-    version, stage : str
-        What ``VE`` and ``ID?`` answer.
-    restart_s : float
-        Simulated time that a reset takes.
+    version, stage : what ``VE`` and ``ID?`` answer.
+    restart_s : simulated time that a reset takes.
     """
 
     address: int

@@ -45,10 +45,8 @@ class StandaEmulator(Emulator):
 
     Attributes
     ----------
-    settings : dict
-        Values of the settings by the last three letters of the commands that read and write them.
-    alarm : bool
-        Motions are taken and not carried out, until `stop`.
+    settings : values of the settings by the last three letters of the commands that read and write them.
+    alarm : motions are taken and not carried out, until `stop`.
     """
 
     pieces = (b"move", b"movr\x00\x01", b"home", b"sstp", b"gets", b"geng", b"smov", bytes(24), b"zero", b"gser")

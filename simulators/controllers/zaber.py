@@ -34,14 +34,7 @@ class Rejected(Exception):
 
 @dataclass
 class ZaberDevice:
-    """One single-axis device of the chain.
-
-    Attributes
-    ----------
-    address, serial_number, device_id : int
-    axis : EmulatedAxis
-    microsteps_per_turn : int
-    """
+    """One single-axis device of the chain."""
 
     address: int
     axis: EmulatedAxis
@@ -217,8 +210,7 @@ class ZaberEmulator(Emulator):
 
     Parameters
     ----------
-    devices : sequence of ZaberDevice
-        In chain order.
+    devices : in chain order.
     """
 
     pieces = (b"/1 1 move abs ", b"/1 home", b"/0 0 01 get pos:", b"/2 set maxspeed ", b"/1 move vel ", b"stop", b"\n")

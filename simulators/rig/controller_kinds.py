@@ -20,8 +20,7 @@ def axis_configs(emulator: Emulator, port: str, *, homed: bool = False) -> list[
 
     Parameters
     ----------
-    homed : bool
-        State it in the rig entry where the device cannot tell; for an emulator that starts with a reference.
+    homed : state it in the rig entry where the device cannot tell; for an emulator that starts with a reference.
     """
     configs: list[AxisConfig] = _entries("axis_configs", emulator, port)
     if homed:

@@ -18,20 +18,15 @@ class Fault:
 
     Attributes
     ----------
-    kind : str
-        ``silent`` no reply; ``stuck`` the axes stand still while they report a motion; ``slow`` axes at `amount`
-        times their speed; ``garbled`` one byte of the reply changed; ``late`` the reply comes `amount` real
-        seconds late; ``foreign`` a reply of another device or request comes instead; ``not_homed`` the axes lose
-        their reference, once; ``slip`` the optics turn by `amount` degrees against their encoders, once; ``jammed``
-        a shutter's blade stays where it is and its sensor agrees with what was asked (``stuck``: with the blade).
-    from_command : int
-        First command affected; the emulator counts commands from 1.
-    from_s : float
-        Simulated time before which nothing happens.
-    commands : int or None
-        Number of commands affected; None for all that follow.
-    amount : float or None
-        See `kind`.
+    kind : ``silent`` no reply; ``stuck`` the axes stand still while they report a motion; ``slow`` axes at `amount`
+        times their speed; ``garbled`` one byte of the reply changed; ``late`` the reply comes `amount` real seconds
+        late; ``foreign`` a reply of another device or request comes instead; ``not_homed`` the axes lose their
+        reference, once; ``slip`` the optics turn by `amount` degrees against their encoders, once; ``jammed`` a
+        shutter's blade stays where it is and its sensor agrees with what was asked (``stuck``: with the blade).
+    from_command : first command affected; the emulator counts commands from 1.
+    from_s : simulated time before which nothing happens.
+    commands : number of commands affected; None for all that follow.
+    amount : see `kind`.
     """
 
     kind: FaultKind
@@ -68,13 +63,7 @@ def parse_fault(text: str) -> Fault:
 
 
 class FaultSchedule:
-    """The faults of one emulator; the same seed changes the same bytes.
-
-    Parameters
-    ----------
-    faults : iterable of Fault
-    seed : int
-    """
+    """The faults of one emulator; the same seed changes the same bytes."""
 
     def __init__(self, faults: Iterable[Fault] = (), seed: int = 0) -> None:
         self._waiting = list(faults)

@@ -14,18 +14,12 @@ class ServeOptions:
 
     Attributes
     ----------
-    model : str or None
-        Model that it says it is.
-    axes : int or None
-        Number of devices, modules or channels.
-    limits_deg : tuple or None
-        Travel of every axis in degrees.
-    speed_deg_s, acceleration_deg_s2 : float
-        A full turn takes 1.4 s with the defaults.
-    homed : bool
-        Start with a reference, at angle zero.
-    true_angle : callable, optional
-        Hidden error: turns the mechanical into the true angle (degrees).
+    model : model that it says it is.
+    axes : number of devices, modules or channels.
+    limits_deg : travel of every axis in degrees.
+    speed_deg_s, acceleration_deg_s2 : a full turn takes 1.4 s with the defaults.
+    homed : start with a reference, at angle zero.
+    true_angle : hidden error: turns the mechanical into the true angle (degrees).
     """
 
     model: str | None = None

@@ -11,8 +11,7 @@ class ServedPort(ABC):
 
     Attributes
     ----------
-    path : str
-        Path of the port, for the client.
+    path : path of the port, for the client.
     """
 
     def __init__(self, path: str) -> None:

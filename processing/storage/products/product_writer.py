@@ -43,19 +43,13 @@ class ProductWriter(OpenH5):
 
     Parameters
     ----------
-    path
-        Of the finished product.
-    kind
-        "mueller", "stokes", ...
-    header
-        Of the capture that the product comes from.
+    path : of the finished product.
+    kind : "mueller", "stokes", ...
+    header : of the capture that the product comes from.
     shape : (rows, columns).
-    planes
-        Dataset name to Plane; the first one is the default signal of a viewer.
-    steps
-        Provenance so far, oldest first.
-    overwrite
-        Replace a finished product of that name.
+    planes : dataset name to Plane; the first one is the default signal of a viewer.
+    steps : provenance so far, oldest first.
+    overwrite : replace a finished product of that name.
 
     Raises
     ------

@@ -24,18 +24,12 @@ class Description:
 
     Attributes
     ----------
-    served : bytes
-        The file as the camera serves it.
-    name : str
-        Name under which it does.
-    root : Element
-        Tree of its XML.
-    source : Path
-        Where it comes from, for messages.
-    arming_s : float
-        Time after an exposure in which the camera ignores a trigger.
-    at_power_up : dict
-        Features that are not at their lowest value when the camera is switched on: entry or number by name.
+    served : the file as the camera serves it.
+    name : name under which it does.
+    root : tree of its XML.
+    source : where it comes from, for messages.
+    arming_s : time after an exposure in which the camera ignores a trigger.
+    at_power_up : features that are not at their lowest value when the camera is switched on: entry or number by name.
     """
 
     served: bytes

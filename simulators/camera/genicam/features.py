@@ -30,12 +30,9 @@ class FeatureValues:
 
     Parameters
     ----------
-    nodes : NodeTree
-        Powered up.
-    sensor : tuple of int
-        Width and height in pixels.
-    complete : bool
-        False plays a camera whose features do not suffice for a capture.
+    nodes : powered up.
+    sensor : width and height in pixels.
+    complete : False plays a camera whose features do not suffice for a capture.
 
     Raises
     ------

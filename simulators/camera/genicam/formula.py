@@ -96,10 +96,8 @@ class Formula:
 
     Parameters
     ----------
-    text : str
-        At most 64 KiB.
-    integer : bool
-        True for those of whole numbers, in which a division cuts off what is behind the point.
+    text : at most 64 KiB.
+    integer : True for those of whole numbers, in which a division cuts off what is behind the point.
 
     Raises
     ------

@@ -40,12 +40,9 @@ class NodeTree:
 
     Parameters
     ----------
-    root : Element
-        The `RegisterDescription`.
-    memory : RegisterMemory
-        Where its registers stand.
-    source : Path
-        File it came from, for messages.
+    root : the `RegisterDescription`.
+    memory : where its registers stand.
+    source : file it came from, for messages.
     """
 
     def __init__(self, root: Element, memory: RegisterMemory, source: Path) -> None:

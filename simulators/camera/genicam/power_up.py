@@ -43,10 +43,8 @@ def power_up(nodes: NodeTree, sensor: tuple[int, int], texts: dict[str, str]) ->
 
     Parameters
     ----------
-    sensor : tuple of int
-        Width and height in pixels.
-    texts : dict
-        Vendor, model and so on by the name of the feature.
+    sensor : width and height in pixels.
+    texts : vendor, model and so on by the name of the feature.
 
     Raises
     ------

@@ -54,14 +54,11 @@ class Register:
 
     Attributes
     ----------
-    address, length : int
-        Bytes.
+    address, length : bytes.
     kind : {"whole", "real", "text"}
         Whole number, floating-point number of 4 or 8 bytes, or text that a zero byte ends.
-    big_endian, signed : bool
-        Byte order; two's complement.
-    bits : tuple of int, or None
-        Lowest and highest bit of a field, counted from the least significant bit of the number.
+    big_endian, signed : byte order; two's complement.
+    bits : lowest and highest bit of a field, counted from the least significant bit of the number.
     """
 
     address: int
