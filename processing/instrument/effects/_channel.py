@@ -1,10 +1,13 @@
 """One number for each detector channel."""
 
 from collections.abc import Sequence
+from typing import ClassVar
 
-from processing.instrument.changes import Conditions
+from processing.arrays import Array
+from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects.base import OpticsEffect
 from processing.instrument.model import InstrumentModel, Polarizer
+from processing.instrument.nominal import shift_nominal
 
 
 class ChannelEffect(OpticsEffect):
@@ -12,6 +15,21 @@ class ChannelEffect(OpticsEffect):
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if len(model.channels) > 1 else ()
+
+
+class ChannelPolarizers(ChannelEffect):
+    """Adds a value for each channel to one field of its polarizer, and does nothing else."""
+
+    field: ClassVar[str]
+
+    def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
+        return tuple(f"{name}.{self.field}" for name in channel_polarizers(model))
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        for k, value in enumerate(values):
+            name = polarizer_of(model, k)
+            if name is not None:
+                shift_nominal(changes, model, f"{name}.{self.field}", value)
 
 
 def polarizer_of(model: InstrumentModel, channel: int) -> str | None:

@@ -7,12 +7,9 @@ Mend: calibrate on air; look through crossed polarizers and note the dark positi
 
 from collections.abc import Sequence
 
-import numpy as np
-
-from processing.arrays import Array
 from processing.effect import Parameter
-from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import OpticsEffect
+from processing.instrument.changes import Conditions
+from processing.instrument.effects.base import NominalShift
 from processing.instrument.model import InstrumentModel, Polarizer
 
 
@@ -22,18 +19,15 @@ def polarizers(model: InstrumentModel) -> tuple[str, ...]:
     return tuple(e.name for e in elements if isinstance(e, Polarizer))
 
 
-class AnalyzerAzimuth(OpticsEffect):
+class AnalyzerAzimuth(NominalShift):
     """All polarizers behind the sample are turned together, in degrees."""
 
     belongs_to = "mechanics"
+    field = "azimuth_deg"
     fixed_parameters = (Parameter("azimuth", "degree", -45, 45, 1.0),)
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if polarizers(model) and model.mosaic is None else ()
 
-    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
-        for name in polarizers(model):
-            changes.azimuth_rad[name] = changes.azimuth_rad[name] + np.deg2rad(values[0])
-
-    def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
-        return tuple(f"{name}.azimuth_deg" for name in polarizers(model))
+    def elements(self, model: InstrumentModel, place: str) -> Sequence[str]:
+        return polarizers(model)

@@ -10,6 +10,7 @@ from processing.arrays import Array
 from processing.effect import Effect, Parameter
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.model import Belongs, InstrumentModel, Retarder
+from processing.instrument.nominal import shift_nominal
 
 
 class InstrumentEffect(Effect, ABC):
@@ -53,6 +54,23 @@ class OpticsEffect(InstrumentEffect):
     """Changes the polarization elements or the detector channels; a known surface shows it too."""
 
     of_optics = True
+
+
+class NominalShift(OpticsEffect):
+    """Adds its value to one field of elements (`processing.instrument.nominal.FIELDS`), and does nothing else."""
+
+    field: ClassVar[str]
+
+    def elements(self, model: InstrumentModel, place: str) -> Sequence[str]:
+        """Names of the elements whose field it shifts."""
+        return (place,)
+
+    def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
+        return tuple(f"{name}.{self.field}" for name in self.elements(model, place))
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        for name in self.shifts(model, place):
+            shift_nominal(changes, model, name, values[0])
 
 
 class SourceEffect(InstrumentEffect):

@@ -5,17 +5,11 @@ polarized light on the plate, or a polarization-dependent reflection.
 Mend: clean and centre the plate, open the stop, set it normal to the axis; then divide by a turn without polarizers.
 """
 
-from collections.abc import Sequence
-
-from processing.instrument.changes import Conditions
 from processing.instrument.effects._transmission import Transmission
-from processing.instrument.effects.base import moving_axes
-from processing.instrument.model import InstrumentModel, Retarder
+from processing.instrument.model import Retarder
 
 
 class RetarderTransmission(Transmission):
     """Transmission of a turning retarder."""
 
-    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        axes = moving_axes(model, conditions)
-        return tuple(e.name for e in model.elements() if isinstance(e, Retarder) and e.axis in axes)
+    element = Retarder
