@@ -123,7 +123,7 @@ class Setup:
         if self.is_gige:
             self._set_packet_size(settings.packet_size or self._config.packet_size)
         elif settings.packet_size is not None:
-            raise self._refused(f"packet_size {settings.packet_size}", "this camera is not on Ethernet")
+            raise self._features.refused(f"packet_size {settings.packet_size}", "this camera is not on Ethernet")
         self._set_trigger(settings.trigger)
         if "GainSelector" not in self._config.features:
             self.light.select_gain()
@@ -131,7 +131,7 @@ class Setup:
         if not {*genicam.CONVERTER_BITS} & self._config.features.keys():
             self.light.set_converter(fmt)
         if self._config.bits is not None and self._config.bits > fmt.bits - self._config.shift:
-            raise self._refused(
+            raise self._features.refused(
                 f"bits {self._config.bits} and shift {self._config.shift} in the rig file",
                 f"{fmt.name} holds {fmt.bits} bits",
             )
@@ -181,7 +181,7 @@ class Setup:
             digits = re.sub(r"\D", "", self._features.text((name,)))
             factor = float(digits) if digits else 1.0
         if factor is not None and factor < 1:
-            raise self._refused(f"read {name}", f"it is {factor:g}, which is no factor. Set it in `features`")
+            raise self._features.refused(f"read {name}", f"it is {factor:g}, which is no factor. Set it in `features`")
         return factor
 
     def _factor(self, what: str) -> int | None:
@@ -189,7 +189,7 @@ class Setup:
         factors = [self._one_factor(f"{what}{axis}") for axis in ("Horizontal", "Vertical")]
         known = {round(factor) for factor in factors if factor is not None}
         if len(known) > 1:
-            raise self._refused(
+            raise self._features.refused(
                 f"read {what}",
                 f"columns and rows have {factors[0]:g} and {factors[1]:g}, a capture holds one factor for both. "
                 f"Give `{what.lower()}` in the settings",
@@ -214,7 +214,7 @@ class Setup:
         if not wanted:
             self._features.switch_off(name)
         elif self._features.find((name,)) is None:
-            raise self._refused(f"switch {name} on", "this camera has no such feature")
+            raise self._features.refused(f"switch {name} on", "this camera has no such feature")
         else:
             self._features.set_flag(name, True)
 
@@ -242,7 +242,9 @@ class Setup:
 
     def _whole(self, name: str, pixels: int, scale: int) -> int:
         if pixels % scale:
-            raise self._refused(f"set {name} to {pixels}", f"this format has {scale} x {scale} of them together")
+            raise self._features.refused(
+                f"set {name} to {pixels}", f"this format has {scale} x {scale} of them together"
+            )
         return pixels // scale
 
     def _set_packet_size(self, packet_size: int | None) -> None:
@@ -250,13 +252,13 @@ class Setup:
         if packet_size is None:
             packet_size = min(_DEFAULT_PACKET_BYTES, mtu or _DEFAULT_PACKET_BYTES)
         if mtu is not None and packet_size > mtu:
-            raise self._refused(f"packet_size {packet_size}", f"interface {interface} has an MTU of {mtu}")
+            raise self._features.refused(f"packet_size {packet_size}", f"interface {interface} has an MTU of {mtu}")
         with self._features.asking(f"set packet size to {packet_size}"):
             self._camera.gv_set_packet_size_adjustment(self._aravis.GvPacketSizeAdjustment.NEVER)
             self._camera.gv_set_packet_size(packet_size)
             back = int(self._camera.gv_get_packet_size())
         if back != packet_size:
-            raise self._refused(f"packet_size {packet_size}", f"it reads back {back}")
+            raise self._features.refused(f"packet_size {packet_size}", f"it reads back {back}")
 
     def _set_trigger(self, trigger: Literal["software", "hardware"] | None) -> None:
         features = self._features
@@ -319,7 +321,9 @@ class Setup:
         """One of two values for the same thing would be dropped in silence."""
         for name in names:
             if name in self._config.features:
-                raise self._refused(f"{name} in `features`", f"{setting} is given as well. Leave one of them out")
+                raise self._features.refused(
+                    f"{name} in `features`", f"{setting} is given as well. Leave one of them out"
+                )
 
     def read_back(self, frame_average: int | None) -> CameraSettings:
         """Every setting as the camera has it now."""
@@ -364,9 +368,4 @@ class Setup:
             black_level=self._features.number(genicam.BLACK_LEVEL),
             reverse_x=self._features.optional_flag("ReverseX"),
             reverse_y=self._features.optional_flag("ReverseY"),
-        )
-
-    def _refused(self, what: str, came_back: str) -> SettingRefused:
-        return SettingRefused(
-            f"camera {self._name}, {what}", came_back, "Change the setting in the plan or the rig file"
         )

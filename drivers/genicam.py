@@ -120,7 +120,7 @@ class Features:
         """
         name = self.find(names)
         if name is None:
-            raise self._refused(f"set {names[0]} to {value:g}", "this camera has no such feature")
+            raise self.refused(f"set {names[0]} to {value:g}", "this camera has no such feature")
         with self.asking(f"set {name} to {value:g}"):
             if self.is_float(name):
                 low, high = self._camera.get_float_bounds(name)
@@ -136,7 +136,7 @@ class Features:
                 self._camera.set_integer(name, value)
                 back = float(self._camera.get_integer(name))
         if not abs(back - value) <= step:
-            raise self._refused(f"set {name} to {value:g}", f"it reads back {back:g}")
+            raise self.refused(f"set {name} to {value:g}", f"it reads back {back:g}")
         return back
 
     def set_choice(self, name: str, value: str) -> None:
@@ -147,11 +147,11 @@ class Features:
         with self.asking(f"set {name} to {value}"):
             entries = list(self._camera.dup_available_enumerations_as_strings(name))
             if value not in entries:
-                raise self._refused(f"set {name} to {value}", f"this camera offers {', '.join(entries)}")
+                raise self.refused(f"set {name} to {value}", f"this camera offers {', '.join(entries)}")
             self._camera.set_string(name, value)
             back = self._camera.get_string(name)
         if back != value:
-            raise self._refused(f"set {name} to {value}", f"it reads back {back}")
+            raise self.refused(f"set {name} to {value}", f"it reads back {back}")
 
     def switch_off(self, name: str) -> None:
         """Switch a yes-or-no feature or an automatic mode off, where the camera has it."""
@@ -170,7 +170,7 @@ class Features:
                 return
             self._camera.set_boolean(name, on)
             if bool(self._camera.get_boolean(name)) != on:
-                raise self._refused(f"switch {name} {wanted}", f"it stays {'off' if on else 'on'}")
+                raise self.refused(f"switch {name} {wanted}", f"it stays {'off' if on else 'on'}")
 
     def set_value(self, name: str, value: bool | int | float | str) -> None:
         """Set any feature to a value of its own kind and read it back.
@@ -180,13 +180,13 @@ class Features:
         """
         asked = f"set {name} to {value}"
         if self.find((name,)) is None:
-            raise self._refused(asked, "this camera has no such feature now")
+            raise self.refused(asked, "this camera has no such feature now")
         node, kinds = self._device.get_feature(name), self._aravis
         if isinstance(node, kinds.GcCommand):
-            raise self._refused(asked, "it is a command and holds no value")
+            raise self.refused(asked, "it is a command and holds no value")
         with self.asking(f"look up {name}"):
             if node.get_actual_access_mode() == kinds.GcAccessMode.RO:
-                raise self._refused(asked, "it can only be read")
+                raise self.refused(asked, "it can only be read")
         # An enumeration is a number and a text to Aravis as well.
         if isinstance(node, kinds.GcBoolean):
             self.set_flag(name, self._of_kind(name, value, bool, "true or false"))
@@ -194,16 +194,16 @@ class Features:
             self.set_choice(name, self._of_kind(name, value, str, f"one of {', '.join(self.choices(name))}"))
         elif isinstance(node, kinds.GcInteger | kinds.GcFloat):
             if isinstance(value, bool | str) or (isinstance(node, kinds.GcInteger) and value != int(value)):
-                raise self._refused(asked, f"it takes a {'whole ' if isinstance(node, kinds.GcInteger) else ''}number")
+                raise self.refused(asked, f"it takes a {'whole ' if isinstance(node, kinds.GcInteger) else ''}number")
             self.set_number((name,), value)
         elif isinstance(node, kinds.GcString):
             self._set_text(name, self._of_kind(name, value, str, "a text"))
         else:
-            raise self._refused(asked, "it is no feature with a value")
+            raise self.refused(asked, "it is no feature with a value")
 
     def _of_kind(self, name: str, value: object, kind: type[T], wanted: str) -> T:
         if not isinstance(value, kind):
-            raise self._refused(f"set {name} to {value}", f"it takes {wanted}")
+            raise self.refused(f"set {name} to {value}", f"it takes {wanted}")
         return value
 
     def _set_text(self, name: str, text: str) -> None:
@@ -211,7 +211,7 @@ class Features:
             self._camera.set_string(name, text)
             back = str(self._camera.get_string(name))
         if back != text:
-            raise self._refused(f"set {name} to {text}", f"it reads back {back!r}")
+            raise self.refused(f"set {name} to {text}", f"it reads back {back!r}")
 
     def dump(self) -> dict[str, str]:
         """Every feature under the root category that can be read now, as text, in the order of the node map."""
@@ -343,7 +343,7 @@ class Features:
 
     def _check_limits(self, name: str, value: float, low: float, high: float) -> None:
         if not low <= value <= high:
-            raise self._refused(f"set {name} to {value:g}", f"its limits are {low:g} to {high:g} now")
+            raise self.refused(f"set {name} to {value:g}", f"its limits are {low:g} to {high:g} now")
 
     def largest(self, name: str, taken: int) -> int:
         """Largest value of a feature of whole numbers that leaves `taken` below its limit, in its steps."""
@@ -363,9 +363,10 @@ class Features:
         step = self._increment(name)
         below = low + (value - low) // step * step
         if below != value:
-            raise self._refused(f"set {name} to {value}", f"it goes in steps of {step}: {below} or {below + step}")
+            raise self.refused(f"set {name} to {value}", f"it goes in steps of {step}: {below} or {below + step}")
 
-    def _refused(self, what: str, came_back: str) -> SettingRefused:
+    def refused(self, what: str, came_back: str) -> SettingRefused:
+        """The error of a setting that the camera does not take."""
         return SettingRefused(
             f"camera {self._name}, {what}", came_back, "Change the setting in the plan or the rig file"
         )

@@ -5,20 +5,15 @@ Mend: read the position after the stage is idle, allow it to settle, calibrate w
 With one known sample, one channel and one throughput it can explain any residual, so it has no name there.
 """
 
-from collections.abc import Sequence
-
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import ValuePerState, moving_axes, turned_by
+from processing.instrument.effects.base import OfTurningAxis, ValuePerState, turned_by
 from processing.instrument.model import InstrumentModel
 
 
-class AnglePerState(ValuePerState):
+class AnglePerState(OfTurningAxis, ValuePerState):
     """Angle error of each state in degrees."""
-
-    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        return moving_axes(model, conditions)
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         return tuple(Parameter(f"state_{k}", "degree", -10, 10, 0.3) for k in range(conditions.states))

@@ -110,6 +110,13 @@ class OfOneCapture(InstrumentEffect):
     of_one_capture = True
 
 
+class OfTurningAxis(InstrumentEffect):
+    """Acts on an axis that turns an element."""
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return moving_axes(model, conditions)
+
+
 class ValuePerState(OfOneCapture):
     """Parameter k acts on state k alone."""
 

@@ -4,25 +4,20 @@ Cause: the encoder's scale or the worm wheel sits eccentric on the shaft (once),
 Mend: map the error with a second encoder or on air, and write the correction into the controller or the model.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from processing.arrays import Array
 from processing.effect import Parameter
-from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import InstrumentEffect, moving_axes, turned_by
+from processing.instrument.changes import Changes
+from processing.instrument.effects.base import OfTurningAxis, turned_by
 from processing.instrument.model import InstrumentModel
 
 
-class RotationEccentricity(InstrumentEffect):
+class RotationEccentricity(OfTurningAxis):
     """Angle error in degrees: cos and sin of the axis angle, then of twice the angle."""
 
     belongs_to = "mechanics"
     fixed_parameters = tuple(Parameter(n, "degree", -5, 5, 0.3) for n in ("cos_1", "sin_1", "cos_2", "sin_2"))
-
-    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        return moving_axes(model, conditions)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         t = np.deg2rad(changes.conditions.angles_deg[place])

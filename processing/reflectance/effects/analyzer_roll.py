@@ -19,8 +19,7 @@ class SurfaceAnalyzerRoll(ReflectanceEffect):
     A known surface shows it; with an unknown sample it is a part of the Mueller matrix.
     """
 
-    def parameters(self, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("azimuth", "degree", -20, 20, 1.0),)
+    fixed_parameters = (Parameter("azimuth", "degree", -20, 20, 1.0),)
 
     def bend(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
         changes.analyzer_rad += float(np.deg2rad(values[0]))

@@ -17,9 +17,7 @@ class ArmZero(ReflectanceEffect):
     """Degrees by which the source stands further round than the arm reads."""
 
     corrects = "geometry"
-
-    def parameters(self, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("arm", "degree", -10, 10, 0.5),)
+    fixed_parameters = (Parameter("arm", "degree", -10, 10, 0.5),)
 
     def bend(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
         changes.arm_rad += float(np.deg2rad(values[0]))

@@ -21,15 +21,17 @@ class ReflectanceEffect(Effect, ABC):
     """
 
     corrects: ClassVar[Literal["", "material", "geometry"]] = ""
+    #: Its parameters where they are the same at every place.
+    fixed_parameters: ClassVar[tuple[Parameter, ...]] = ()
     rough = 1e-3
 
     def places_on(self, shape: str) -> Sequence[str]:
         """Where it can act on an object in front of a camera: `shape` is "sphere", "flat" or "mesh"."""
         return ("",)
 
-    @abstractmethod
     def parameters(self, place: str) -> tuple[Parameter, ...]:
         """The parameters at a place."""
+        return self.fixed_parameters
 
     @abstractmethod
     def bend(self, changes: ReflectanceChanges, place: str, values: Array) -> None:

@@ -15,8 +15,7 @@ from processing.reflectance.effects.base import ReflectanceEffect
 class SurfaceIlluminationAzimuth(ReflectanceEffect):
     """Degrees by which the generator azimuth is off."""
 
-    def parameters(self, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("azimuth", "degree", -20, 20, 1.0),)
+    fixed_parameters = (Parameter("azimuth", "degree", -20, 20, 1.0),)
 
     def bend(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
         changes.generator_rad += float(np.deg2rad(values[0]))

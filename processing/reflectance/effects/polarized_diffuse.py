@@ -17,9 +17,7 @@ class PolarizedDiffuse(ReflectanceEffect):
 
     corrects = "material"
     has_bent_valley = True
-
-    def parameters(self, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("a", "1", -2.0, 2.0, 0.1), Parameter("log_b", "1", -1.5, 2.0, 0.5))
+    fixed_parameters = (Parameter("a", "1", -2.0, 2.0, 0.1), Parameter("log_b", "1", -1.5, 2.0, 0.5))
 
     def bend(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
         changes.diffuse_a += float(values[0])

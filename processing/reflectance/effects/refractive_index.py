@@ -17,9 +17,7 @@ class RefractiveIndex(ReflectanceEffect):
 
     corrects = "material"
     has_bent_valley = True
-
-    def parameters(self, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("n", "1", -0.3, 0.3, 0.05), Parameter("k", "1", -0.3, 0.3, 0.05))
+    fixed_parameters = (Parameter("n", "1", -0.3, 0.3, 0.05), Parameter("k", "1", -0.3, 0.3, 0.05))
 
     def bend(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
         changes.index += complex(*values)

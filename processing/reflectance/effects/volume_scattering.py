@@ -14,8 +14,7 @@ from processing.reflectance.effects.base import ReflectanceEffect
 class VolumeScattering(ReflectanceEffect):
     """Share of the dipole's Jones matrix beside the first surface's, which has the same strength; 1 is all dipole."""
 
-    def parameters(self, place: str) -> tuple[Parameter, ...]:
-        return (Parameter("share", "1", -1.0, 4.0, 0.2),)
+    fixed_parameters = (Parameter("share", "1", -1.0, 4.0, 0.2),)
 
     def bend(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
         changes.volume += float(values[0])
