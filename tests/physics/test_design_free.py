@@ -26,11 +26,6 @@ analyzer:
 
 
 @pytest.fixture
-def rgb950(configs):
-    return InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
-
-
-@pytest.fixture
 def stokes():
     return parse_yaml(STOKES, InstrumentModel, "stokes.yaml")
 

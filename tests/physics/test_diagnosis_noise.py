@@ -11,7 +11,6 @@ from processing.diagnosis.instrument.projection import add_block, noise_informat
 from processing.diagnosis.instrument.structure import Images, Residual, _tests, descriptions
 from processing.diagnosis.search.linearization import _with_noise_of_counts
 from processing.diagnosis.search.space import Sums
-from processing.instrument.model import InstrumentModel
 
 STATES, SIDE, SIGMA = 8, 240, 0.01
 
@@ -68,12 +67,11 @@ def test_tests_of_pure_noise_scatter_by_one_standard_deviation():
     assert np.std(scores, axis=0) == pytest.approx(np.ones(5), abs=0.25)
 
 
-def test_noise_of_light_is_told_where_the_sample_shows_few_of_its_elements(configs):
+def test_noise_of_light_is_told_where_the_sample_shows_few_of_its_elements(rgb950):
     """Of 16 directions over the states ten hold noise alone, most of it that of bright pixels."""
     random, states, side, electrons = np.random.default_rng(9), 40, 44, 50_000.0
-    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
     turned = 9.0 * np.arange(states)
-    rows = model.rows({"psg": turned, "psa": 4.91 * turned}).reshape(states, 16)
+    rows = rgb950.rows({"psg": turned, "psa": 4.91 * turned}).reshape(states, 16)
     m = np.zeros((16, side, side))
     m[0] = np.exp(random.normal(size=(side, side)) - 3)
     m[[1, 4, 5, 10, 15]] = m[0] * random.uniform(-0.3, 0.3, (5, side, side))

@@ -49,8 +49,8 @@ class TestEveryEffectOfTheReflectance(ReflectanceEffectConformance):
         return request.param
 
 
-def test_an_effect_of_one_capture_holds_for_that_capture_only(configs):
-    model, capture = small_capture(InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662))
+def test_an_effect_of_one_capture_holds_for_that_capture_only(rgb950):
+    model, capture = small_capture(rgb950)
     drift = AppliedEffect(
         kind="source_drift",
         scope="capture",
@@ -64,8 +64,8 @@ def test_an_effect_of_one_capture_holds_for_that_capture_only(configs):
     assert changed.rows(angles, changes_at(changed, angles)) == pytest.approx(model.rows(angles))
 
 
-def test_rows_of_an_instrument_with_effects_need_their_changes(configs):
-    model, capture = small_capture(InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662))
+def test_rows_of_an_instrument_with_effects_need_their_changes(rgb950):
+    model, capture = small_capture(rgb950)
     turned = AppliedEffect(
         kind="psg_azimuth", element="psg_retarder", parameters={"azimuth": EffectParameter(value=1.0, unit="degree")}
     )
@@ -77,8 +77,8 @@ def test_rows_of_an_instrument_with_effects_need_their_changes(configs):
 
 
 @pytest.mark.parametrize(("kind", "element"), [("gremlin", None), ("psg_azimuth", "lens"), ("psg_azimuth", None)])
-def test_unknown_effects_are_refused(kind, element, configs):
-    model, capture = small_capture(InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662))
+def test_unknown_effects_are_refused(kind, element, rgb950):
+    model, capture = small_capture(rgb950)
     with pytest.raises(EffectError):
         apply_to(Changes(capture.conditions), model, AppliedEffect(kind=kind, element=element, parameters={}))
 

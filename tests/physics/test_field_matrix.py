@@ -1,7 +1,5 @@
 """A matrix interpolated over the image, against the matrix itself."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,15 +9,14 @@ from processing.instrument.states import rotating_retarders
 from processing.reduction.solvers.field_matrix import TOLERANCE, FieldMatrix
 
 
-def test_pseudo_inverse_with_two_retardance_maps(configs: Path) -> None:
-    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
+def test_pseudo_inverse_with_two_retardance_maps(rgb950: InstrumentModel) -> None:
     angles = rotating_retarders(0.01).angles_deg
 
     def pinv(y: float, x: float) -> np.ndarray:
-        generator = model.generator[1].model_copy(update={"retardance_deg": 127.12 + 4 * x - 2 * y + 3 * x * x})
-        analyzer = model.analyzer[0].model_copy(update={"retardance_deg": 94.78 + 5 * x * y - 3 * y})
-        pixel = model.model_copy(
-            update={"generator": (model.generator[0], generator), "analyzer": (analyzer, model.analyzer[1])}
+        generator = rgb950.generator[1].model_copy(update={"retardance_deg": 127.12 + 4 * x - 2 * y + 3 * x * x})
+        analyzer = rgb950.analyzer[0].model_copy(update={"retardance_deg": 94.78 + 5 * x * y - 3 * y})
+        pixel = rgb950.model_copy(
+            update={"generator": (rgb950.generator[0], generator), "analyzer": (analyzer, rgb950.analyzer[1])}
         )
         return np.asarray(np.linalg.pinv(pixel.rows(angles)[:, 0]))
 

@@ -37,21 +37,16 @@ def mueller_product(synthetic_capture, tmp_path, model, truth, random, name="a",
     return out
 
 
-@pytest.fixture
-def plain(configs):
-    return InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
-
-
 @pytest.mark.long
-def test_means_of_1024_pixels_hold_their_errors(plain, synthetic_capture, tmp_path):
+def test_means_of_1024_pixels_hold_their_errors(rgb950, synthetic_capture, tmp_path):
     """Every number of 20 means: all within a few of their errors, 95 % inside their intervals."""
     random = np.random.default_rng(11)
-    bright = mueller_product(synthetic_capture, tmp_path, plain, plain, random, "bright", 100.0)
+    bright = mueller_product(synthetic_capture, tmp_path, rgb950, rgb950, random, "bright", 100.0)
     truth = {mean.name: mean.value for mean in mean_of([bright], WHOLE)}
     assert truth["depolarization_index"] == pytest.approx(float(depolarization_index(SAMPLE)), abs=0.001)
     inside, pulls = {}, {}
     for k in range(20):
-        product = mueller_product(synthetic_capture, tmp_path, plain, plain, random, f"m{k}")
+        product = mueller_product(synthetic_capture, tmp_path, rgb950, rgb950, random, f"m{k}")
         for mean in mean_of([product], WHOLE):
             if mean.name == "m00" or mean.unit == "degree":
                 continue
@@ -170,17 +165,17 @@ def test_the_command_writes_csv_json_and_a_budget(stated, synthetic_capture, tmp
     assert wrong.exit_code != 0
 
 
-def test_what_does_not_exist_in_a_mean_has_its_whole_range(plain, synthetic_capture, tmp_path):
+def test_what_does_not_exist_in_a_mean_has_its_whole_range(rgb950, synthetic_capture, tmp_path):
     """Its interval was NaN to NaN."""
-    product = mueller_product(synthetic_capture, tmp_path, plain, plain, np.random.default_rng(2), "dim", 0.02)
+    product = mueller_product(synthetic_capture, tmp_path, rgb950, rgb950, np.random.default_rng(2), "dim", 0.02)
     pixels = [(slice(0, 1), slice(k, k + 1)) for k in range(12)]
     means = [v for pixel in pixels for v in mean_of([product], pixel) if v.name == "retardance_deg"]
     assert any(np.isnan(v.value) for v in means)
     assert all((v.low, v.high) == (0, 180) for v in means if np.isnan(v.value))
 
 
-def test_quantities_of_parts_are_those_of_the_whole_image(plain, synthetic_capture, tmp_path, monkeypatch):
-    product = mueller_product(synthetic_capture, tmp_path, plain, plain, np.random.default_rng(2))
+def test_quantities_of_parts_are_those_of_the_whole_image(rgb950, synthetic_capture, tmp_path, monkeypatch):
+    product = mueller_product(synthetic_capture, tmp_path, rgb950, rgb950, np.random.default_rng(2))
     image, moves = MuellerImage.load(product), np.random.default_rng(3).normal(size=(2, 16, 32, 32))
     whole = quantities.quantities_block(image, quantities.EXTRA, {}, moves)
     monkeypatch.setattr(quantities, "CACHED_PIXELS", 300)

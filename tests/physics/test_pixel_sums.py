@@ -13,7 +13,6 @@ from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import Projected, add_block
 from processing.diagnosis.instrument.tiles import TileSlopes, add_tiles
 from processing.diagnosis.search.space import Sums
-from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Sample
 from simulators.blind.undeclared_captures import TrueBench, TrueScene, digitize, expose, state_angles, write_capture
@@ -84,7 +83,7 @@ def test_derivatives_of_a_part_are_those_of_the_image(capture):
 
 
 @pytest.mark.parametrize("side", [1, 2, 3])
-def test_squares_are_averaged_while_they_are_read(configs, tmp_path, monkeypatch, side):
+def test_squares_are_averaged_while_they_are_read(configs, rgb950, tmp_path, monkeypatch, side):
     bench, random = TrueBench(rows=31, columns=33), np.random.default_rng(2)
     angles = state_angles(20, False, False)
     counts = digitize(bench, expose(bench, TrueScene(random), angles), random)
@@ -93,7 +92,7 @@ def test_squares_are_averaged_while_they_are_read(configs, tmp_path, monkeypatch
     write_capture(tmp_path / "c.h5", bench, counts, angles, sample=Sample(kind="unknown"), instrument=text)
     monkeypatch.setattr("processing.diagnosis.captures.read_capture.MOST_READ", counts.size / (side - 0.5) ** 2)
     with Capture(tmp_path / "c.h5") as capture:
-        data = read_capture(capture, InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662))
+        data = read_capture(capture, rgb950)
     assert (data.binned, data.pitch) == (side, side)
     h, w = 31 // side, 33 // side
     squares = counts[:, : h * side, : w * side].reshape(20, h, side, w, side).astype(float) - 100

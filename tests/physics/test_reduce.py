@@ -7,6 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from reduced_capture import STEP, reduced
 
 from processing.errors import NotDetermined, ProcessError
 from processing.instrument.model import InstrumentModel
@@ -16,15 +17,9 @@ from processing.reduction.mueller import reduce_mueller
 from processing.storage.captures.capture import Capture, CaptureError
 from processing.storage.products.images import MuellerImage
 from processing.storage.products.pixel_mask import Mask
-from processing.storage.products.product import Product, Step
+from processing.storage.products.product import Product
 
 GAIN, READ_NOISE, BLACK = 2.5, 4.0, 64.0
-STEP = Step("reduce", {"capture": "capture.h5"})
-
-
-@pytest.fixture
-def rgb950(configs: Path) -> InstrumentModel:
-    return InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
 
 
 def table(states: int = 40) -> dict[str, np.ndarray]:
@@ -49,13 +44,6 @@ def signals(model: InstrumentModel, angles: dict[str, np.ndarray], m: np.ndarray
 def noisy(rng: np.random.Generator, signal: np.ndarray, black: float = BLACK, bits: int = 16) -> np.ndarray:
     electrons = rng.poisson(np.maximum(signal, 0) * GAIN) + rng.normal(0, READ_NOISE, signal.shape)
     return np.clip(np.rint(electrons / GAIN + black), 0, 2**bits - 1).astype(np.uint16)
-
-
-def reduced(path: Path, model: InstrumentModel, **options: object) -> MuellerImage:
-    out = path.with_suffix(".product.h5")
-    with Capture(path) as capture:
-        reduce_mueller(capture, model, out, (STEP,), overwrite=True, **options)
-    return MuellerImage.load(out)
 
 
 def detector(**extra: object) -> dict[str, object]:

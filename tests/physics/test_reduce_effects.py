@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from reduced_capture import reduced
 
 from processing.instrument.applied_effects import changes_at, changes_of, instrument_effects
 from processing.instrument.changes import Conditions, field_terms
@@ -22,11 +23,6 @@ FULL_SCALE = 4095.0
 ANGLES = {"psg": 9.0 * np.arange(40), "psa": 4.91 * 9.0 * np.arange(40)}
 
 
-@pytest.fixture
-def rgb950(configs: Path) -> InstrumentModel:
-    return InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
-
-
 def smooth_scene() -> np.ndarray:
     """Mueller image (4, 4, rows, columns) of m00 about 4000 counts that varies slowly."""
     y, x = np.indices(SHAPE) / 12
@@ -39,13 +35,6 @@ def effect(kind: str, element: str | None = None, captures: tuple[str, ...] = ()
     scope = "capture" if captures else "instrument"
     values = {k: EffectParameter(value=v, unit="1") for k, v in parameters.items()}
     return AppliedEffect(kind=kind, element=element, parameters=values, scope=scope, captures=captures)
-
-
-def reduced(path: Path, model: InstrumentModel) -> MuellerImage:
-    out = path.with_suffix(".m.h5")
-    with Capture(path) as capture:
-        reduce_mueller(capture, model, out, (Step("reduce", {}),), overwrite=True)
-    return MuellerImage.load(out)
 
 
 def error(image: MuellerImage, truth: np.ndarray) -> float:
@@ -243,7 +232,7 @@ def test_the_product_says_at_which_moment_it_holds(rgb950, synthetic_capture):
     rows = rgb950.rows(ANGLES).reshape(-1, 16)
     signal = np.tensordot(rows, smooth_scene().reshape(16, *SHAPE), axes=1)[:, None]
     path = capture_of(synthetic_capture, signal)
-    out = path.with_suffix(".m.h5")
+    out = path.with_suffix(".product.h5")
     with Capture(path) as capture:
         drift = (
             effect("image_drift", captures=(capture.name,), x=1.0, y=0.5),

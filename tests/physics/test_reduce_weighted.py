@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.optimize
+from reduced_capture import reduced
 
 from processing.errors import ProcessError
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
@@ -22,11 +23,6 @@ DETECTOR = {"black_level_counts": BLACK, "gain_e_per_count": GAIN, "read_noise_e
 ANGLES = {"psg": 9.0 * np.arange(40), "psa": 4.91 * 9.0 * np.arange(40)}
 
 
-@pytest.fixture
-def rgb950(configs: Path) -> InstrumentModel:
-    return InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
-
-
 def pure(rng: np.random.Generator, xi0: float = 0.97) -> np.ndarray:
     """Mueller matrix (4, 4), m00 = 1: a random Mueller-Jones matrix with a little depolarization."""
     jones = rng.normal(size=(2, 2)) + 1j * rng.normal(size=(2, 2))
@@ -42,18 +38,11 @@ def capture_of(m: np.ndarray, rng: np.random.Generator, model: InstrumentModel, 
     return write(counts, ANGLES, detector=DETECTOR)
 
 
-def reduced(path: Path, model: InstrumentModel, choice: Choice) -> MuellerImage:
-    out = path.with_suffix(".m.h5")
-    with Capture(path) as capture:
-        reduce_mueller(capture, model, out, (Step("reduce", {}),), choice=choice, overwrite=True)
-    return MuellerImage.load(out)
-
-
 def test_unit_variance_and_smaller_errors(rgb950: InstrumentModel, synthetic_capture) -> None:
     rng = np.random.default_rng(2)
     m = np.broadcast_to(2500 * pure(rng)[..., None, None], (4, 4, 40, 50)).copy()
     path = capture_of(m, rng, rgb950, synthetic_capture)
-    weighted, plain = (reduced(path, rgb950, Choice(weighted=flag)) for flag in (True, False))
+    weighted, plain = (reduced(path, rgb950, choice=Choice(weighted=flag)) for flag in (True, False))
     pulls = (weighted.values - m) / weighted.errors
     assert np.mean(pulls**2) == pytest.approx(1.0, abs=0.03)
     assert np.mean(weighted.errors**2) < 0.9 * np.mean(plain.errors**2)
@@ -64,7 +53,7 @@ def test_unit_variance_and_smaller_errors(rgb950: InstrumentModel, synthetic_cap
 def test_unknown_noise_is_an_error(rgb950: InstrumentModel, synthetic_capture) -> None:
     path = synthetic_capture(np.ones((40, 1, 4, 6)), ANGLES)
     with pytest.raises(ProcessError, match="does not know its gain"):
-        reduced(path, rgb950, Choice(weighted=True))
+        reduced(path, rgb950, choice=Choice(weighted=True))
     with pytest.raises(ProcessError, match="need the weighted"):
         Choice(covariance=True)
     with pytest.raises(ProcessError, match="none of nearest, likelihood"):
@@ -130,10 +119,10 @@ def test_physical_estimate_stands_beside_the_plain_one(
     rng = np.random.default_rng(5)
     m = np.broadcast_to(1500 * pure(rng, 0.99)[..., None, None], (4, 4, 10, 12))
     path = capture_of(m, rng, rgb950, synthetic_capture)
-    plain = reduced(path, rgb950, Choice(weighted=True))
-    image = reduced(path, rgb950, Choice(weighted=True, physical=physical))
+    plain = reduced(path, rgb950, choice=Choice(weighted=True))
+    image = reduced(path, rgb950, choice=Choice(weighted=True, physical=physical))
     np.testing.assert_array_equal(image.values, plain.values)
-    with Product(path.with_suffix(".m.h5")) as product:
+    with Product(path.with_suffix(".product.h5")) as product:
         estimate = product.get("mueller_physical")
     assert np.all(smallest_eigenvalue(estimate.reshape(16, -1)) > -1e-3)
     assert np.mean((estimate - m) ** 2) < np.mean((plain.values - m) ** 2)

@@ -8,7 +8,6 @@ from noisy_images import noisy_image
 
 from processing.errors import NotDetermined
 from processing.geometry.frames import ScatteringGeometry
-from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.maps.material_fit import covariance_by_light, determined_values
 from processing.polarization.cloude import xi0_and_dominant
@@ -38,8 +37,7 @@ def sphere(configs) -> tuple[ScatteringGeometry, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def w40(configs) -> np.ndarray:
-    rgb950 = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
+def w40(rgb950) -> np.ndarray:
     return rgb950.rows(rotating_retarders(1.0).angles_deg).reshape(-1, 16)
 
 

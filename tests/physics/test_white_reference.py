@@ -78,9 +78,8 @@ class Bench:
 
 
 @pytest.fixture
-def bench(synthetic_capture, tmp_path, configs):
-    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
-    return Bench(synthetic_capture, tmp_path, model, configs / "geometries/one_inch_sphere.yaml")
+def bench(synthetic_capture, tmp_path, configs, rgb950):
+    return Bench(synthetic_capture, tmp_path, rgb950, configs / "geometries/one_inch_sphere.yaml")
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import pytest
 from processing.errors import ProcessError
 from processing.geometry.frames import ScatteringGeometry
 from processing.geometry.rusinkiewicz import directions
-from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.polarization import mueller, triply_degenerate
 from processing.polarization.xi0 import estimate, xi0_and_m00
@@ -37,13 +36,12 @@ def measured(m: np.ndarray, w: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("states", ["stokes", "40"])
-def test_exact_without_noise(red, configs, states, weighted):
+def test_exact_without_noise(red, rgb950, states, weighted):
     m0 = red.mueller_jones(surface(500), 662)
     xi0 = np.linspace(0.25, 1.0, 500)
     m00 = np.linspace(0.1, 2.0, 500)
     w = linear_stokes(VERTICAL)
     if states == "40":
-        rgb950 = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
         w = rgb950.rows(rotating_retarders(1.0).angles_deg).reshape(-1, 16)
     p = measured(triply_degenerate.mueller_matrix(m0, xi0, m00), w)
     e = estimate(p, np.ones_like(p) * 1e-8, w, m0, weighted=weighted)
@@ -84,8 +82,7 @@ def test_the_mask_looks_at_the_noise_and_not_at_xi0(red):
     assert np.ptp(shares) < 0.04
 
 
-def test_without_variance_the_residual_gives_the_error_bars(red, configs):
-    rgb950 = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
+def test_without_variance_the_residual_gives_the_error_bars(red, rgb950):
     w = rgb950.rows(rotating_retarders(1.0).angles_deg).reshape(-1, 16)
     m0 = np.tile(red.mueller_jones(surface(100), 662), (40, 1, 1))
     p = measured(triply_degenerate.mueller_matrix(m0, 0.5), w)
