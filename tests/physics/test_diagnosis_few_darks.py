@@ -118,6 +118,7 @@ def test_darks_of_a_mosaic_take_no_slope_of_the_light(synthetic_capture, configs
     assert (found.verdict, found.effects) == ("consistent", ())
 
 
+@pytest.mark.long
 def test_a_bend_is_named_where_read_noise_is_a_quarter_of_a_count(synthetic_capture):
     """What rounding may do to whole frames is no reason to look no longer at the noise of the light behind a bend."""
     turned, bend, gain = 4.5 * np.arange(40), 0.03, 1.3

@@ -107,6 +107,7 @@ def test_a_focus_that_follows_a_plate_is_corrected_without_a_name(configs, tmp_p
     assert "blur of image by 1 x psg" in [e.element for e in diagnosis.applied()]
 
 
+@pytest.mark.long
 def test_a_cloud_before_the_lamp_is_no_fault_of_a_plate(configs, tmp_path, bench):
     bench.level.append(lambda k, a: 1 - 0.02 * np.exp(-(((k - 18) / 4) ** 2)))
     diagnosis = diagnosed(tmp_path, configs, bench)
@@ -114,6 +115,7 @@ def test_a_cloud_before_the_lamp_is_no_fault_of_a_plate(configs, tmp_path, bench
     assert "gain of source wandering" in sentences(diagnosis)
 
 
+@pytest.mark.long
 def test_light_that_moves_over_a_disc_is_no_image_that_moves(configs, tmp_path, bench):
     x = np.linspace(-1, 1, PIXELS)
     bench.light.append(lambda k, e: e * (1 + 0.03 * x * (k / (STATES - 1) - 0.5)))
