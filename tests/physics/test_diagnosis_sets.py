@@ -10,6 +10,7 @@ from scipy.special import betaln
 from processing.diagnosis.search.averages import likely_starts, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
+from processing.diagnosis.search.decision import predicted_change
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.posterior import Posterior
@@ -74,6 +75,26 @@ def test_where_the_noise_is_unknown_it_is_one_of_the_unknowns():
             fit = sets.fitted(state)
             second[fit.active] += w * (np.diag(fit.covariance) + fit.mean**2)
     assert np.diag(samples.covariance) + samples.mean**2 == pytest.approx(second, rel=0.1)
+
+
+def test_the_chance_of_a_worse_result_is_that_of_all_sets():
+    """What no data show is absent or large: that is no normal distribution of a small width."""
+    problem = Quadratic(50.0, np.array([-0.35 * 400, 0.0]), np.diag([400.0, 1e-6]))
+    sets = Sets(problem, groups(1, 1), QUIET)
+    samples = stay(sets, likely_starts(sets, likely_set(sets)), 1000)
+    random, ones, correction = np.random.default_rng(3), np.ones((2, 2)), np.array([samples.mean[0], 0.0])
+    states = [State(np.array(tau)) for tau in product([0.0, *TAU], repeat=2)]
+    scores = np.array([sets.score(state) for state in states])
+    weight = np.exp(scores - scores.max())
+    fits, grew = [sets.fitted(state) for state in states], []
+    for k in random.choice(len(states), 20_000, p=weight / weight.sum()):
+        fit, true = fits[k], np.zeros(2)
+        true[fit.active] = fit.mean + np.sqrt(np.diag(fit.covariance)) * random.standard_normal(fit.active.size)
+        grew.append(abs((true - correction).sum()) > abs(true.sum()))
+    change = predicted_change(correction, samples.mean, samples.covariance, ones, along=samples.along)
+    assert change.chance_worse == pytest.approx(np.mean(grew), rel=0.25)
+    normal = predicted_change(correction, samples.mean, samples.covariance, ones)
+    assert normal.chance_worse > 1.5 * np.mean(grew)
 
 
 def test_one_cause_that_does_what_two_do_has_its_share_from_either_side():

@@ -108,6 +108,7 @@ class MuellerErrors:
     space : candidates that may move M; values (K,), covariance (K, K) : of the posterior.
     products : (16, K, K) of the slopes of each element of M/m00, mean over elements and captures.
     of_captures : of each capture, the values that act on it and products (J, J) of their slopes.
+    posterior, index : of which these are the values (K,).
     """
 
     space: Space
@@ -115,6 +116,8 @@ class MuellerErrors:
     covariance: Array
     products: Array
     of_captures: tuple[tuple[NDArray[np.int64], Array], ...]
+    posterior: Posterior
+    index: NDArray[np.int64]
 
     @classmethod
     def of(cls, problem: InstrumentProblem, posterior: Posterior, solved: Solution) -> MuellerErrors:
@@ -127,7 +130,7 @@ class MuellerErrors:
         for acting, part in mueller_slopes(problem, space, values, _residual_rms(problem, solved)):
             products[:, acting[:, None], acting] += part / captures
             each.append((acting, part.sum(axis=0)))
-        return cls(space, values, posterior.covariance[np.ix_(index, index)], products, tuple(each))
+        return cls(space, values, posterior.covariance[np.ix_(index, index)], products, tuple(each), posterior, index)
 
     def corrected_values(self, used: Solution) -> Array:
         """Values (K,) that a correction applies."""
@@ -144,7 +147,13 @@ class MuellerErrors:
         )
 
     def _change(self, index: NDArray[np.int64], correction: Array, products: Array) -> PredictedChange:
-        return predicted_change(correction[index], self.values[index], self.covariance[np.ix_(index, index)], products)
+        def along(weights: Array) -> tuple[Array, Array, Array]:
+            of_all = np.zeros(self.posterior.values.size)
+            of_all[self.index[index]] = weights
+            return self.posterior.along(of_all)
+
+        covariance = self.covariance[np.ix_(index, index)]
+        return predicted_change(correction[index], self.values[index], covariance, products, along=along)
 
     def uncertain(self, problem: InstrumentProblem, used: Solution) -> tuple[SystematicError, MuellerError] | None:
         """Remaining uncertainty of M/m00 about the applied values, as a file stores it and as the answer reports it.

@@ -17,7 +17,7 @@ from processing.arrays import Array
 from processing.diagnosis.search.likely_set import PATIENCE, climb
 from processing.diagnosis.search.range_of import NEARLY_ZERO
 from processing.diagnosis.search.rules import ALTERNATIVE, SHARES
-from processing.diagnosis.search.sets import Conditional, Sets, State
+from processing.diagnosis.search.sets import Conditional, SetFit, Sets, State
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class Samples:
     ----------
     probability : (G,) of each group to be there; mean (K,), covariance (K, K) of the parameters in typical sizes.
     sets : (S, G) which groups were there; weight : (S,), sum 1.
+    fits : the sets with a share that counts, each with that share (sum 1).
     best : the most likely set.
     """
 
@@ -36,11 +37,21 @@ class Samples:
     covariance: Array
     sets: NDArray[np.bool_]
     weight: Array
+    fits: tuple[tuple[float, SetFit], ...]
     best: State
 
     def any_of(self, members: Sequence[int]) -> float:
         """Probability that at least one of some groups is there."""
         return float(self.weight @ self.sets[:, list(members)].any(axis=1))
+
+    def along(self, direction: Array) -> tuple[Array, Array, Array]:
+        """Share (S,), mean (S,) and standard deviation (S,) of a sum of parameters with weights (K,), in each set."""
+        rows = [
+            (share, direction[fit.active] @ fit.mean, direction[fit.active] @ fit.covariance @ direction[fit.active])
+            for share, fit in self.fits
+        ]
+        share, mean, variance = np.array(rows).T
+        return share, mean, np.sqrt(np.maximum(variance, 0.0))
 
 
 def chance_of(sets: Sets, c: Conditional) -> Array:
@@ -117,6 +128,11 @@ class _ByStay:
         if np.log(random.random()) < self._sets.score(new) - self._sets.score(state):
             state.unit = new.unit
 
+    def fits(self) -> tuple[tuple[float, SetFit], ...]:
+        """The sets with a share that counts, each with that share."""
+        likely = {key: stays for key, stays in self._seen.items() if stays > NEARLY_ZERO * sum(self._seen.values())}
+        return tuple((stays / sum(likely.values()), self._known[key][0]) for key, stays in likely.items())
+
     def moments(self) -> tuple[Array, Array, Array]:
         """Probability (G,) of each group; mean (K,) and covariance (K, K) of the parameters."""
         sets, total = self._sets, sum(self._seen.values())
@@ -145,7 +161,7 @@ def stay(sets: Sets, starts: Iterable[tuple[State, float]], changes: int) -> Sam
     for start, share in starts:
         average.visit(start, share, max(1, round(changes * share)), random)
     assert average.best is not None
-    return Samples(*average.moments(), *average.inclusion(), sets.settled(average.best[1]))
+    return Samples(*average.moments(), *average.inclusion(), average.fits(), sets.settled(average.best[1]))
 
 
 def likely_starts(sets: Sets, state: State) -> list[tuple[State, float]]:

@@ -5,7 +5,7 @@ No correction is written that makes a measurement worse: figures before and afte
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,29 +58,31 @@ def _rows_pair(name: str, ranks: Sequence[float], conditions: Sequence[float]) -
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PredictedChange:
     """Change of the result (M/m00, xi0) by a correction, as the posterior expects it; all rms over pixels.
 
     Attributes
     ----------
     before, after : error without and with the correction.
-    size : of the change; expected, stderr : how far the true one goes along it, and the standard error of that.
+    size : of the change; expected, stderr : how far the true one goes along it, and the standard error of that, also
+        (S,) of several sets of causes, each with its share.
     """
 
     before: float
     after: float
     size: float
-    expected: float
-    stderr: float
+    expected: float | Array
+    stderr: float | Array
+    share: float | Array = 1.0
 
     @property
     def chance_worse(self) -> float:
         """Chance that the error grows: that the true change goes less than half as far along this one."""
         if self.size <= LEAST_CHANGE:
             return 0.0
-        beyond = self.expected - self.size / 2
-        return float(ndtr(-beyond / self.stderr)) if self.stderr > 0 else float(beyond < 0)
+        missing = (self.size / 2 - self.expected) / np.maximum(self.stderr, 1e-9 * self.size)
+        return float(np.sum(self.share * ndtr(missing)))
 
     @property
     def rounded_chance(self) -> float:
@@ -88,17 +90,23 @@ class PredictedChange:
         return round(self.chance_worse, 4)
 
 
-def predicted_change(correction: Array, mean: Array, covariance: Array, products: Array) -> PredictedChange:
+#: Share (S,), mean (S,) and standard deviation (S,) in each set of causes of a sum of values with weights (K,).
+Along = Callable[[Array], tuple[Array, Array, Array]]
+
+
+def predicted_change(
+    correction: Array, mean: Array, covariance: Array, products: Array, *, along: Along | None = None
+) -> PredictedChange:
     """Change by a `correction` (K,), where the true values have a mean (K,) and a covariance (K, K).
 
-    `products` (K, K) of the slopes of what the user reads, averaged.
+    `products` (K, K) of the slopes of what the user reads, averaged. Without `along` the values are normal.
     """
-    variance = max(float(np.sum(products * covariance)), 0.0)
-    along, missed = products @ correction, mean - correction
-    size = float(np.sqrt(max(float(correction @ along), 0.0)))
-    stderr = float(np.sqrt(max(float(along @ covariance @ along), 0.0))) / max(size, 1e-300)
+    missed, variance = mean - correction, max(float(np.sum(products * covariance)), 0.0)
+    size = float(np.sqrt(max(float(correction @ products @ correction), 0.0)))
     before, after = (np.sqrt(variance + max(float(v @ products @ v), 0.0)) for v in (mean, missed))
-    return PredictedChange(float(before), float(after), size, float(mean @ along) / max(size, 1e-300), stderr)
+    w = products @ correction / max(size, 1e-300)
+    share, expected, stderr = along(w) if along else (1.0, mean @ w, np.sqrt(max(float(w @ covariance @ w), 0.0)))
+    return PredictedChange(float(before), float(after), size, expected, stderr, share)
 
 
 def chance_checks(quantity: str, change: PredictedChange) -> tuple[Check, Check]:

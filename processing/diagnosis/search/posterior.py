@@ -83,6 +83,13 @@ class Posterior:
         values[fit.active], covariance[np.ix_(fit.active, fit.active)] = fit.mean, fit.covariance
         return values * typical, covariance * np.outer(typical, typical)
 
+    def along(self, direction: Array) -> tuple[Array, Array, Array]:
+        """Share (S,), mean (S,) and standard deviation (S,) of a sum of values with weights (K,), in each set."""
+        scaled = direction * self.space.joined("typical")
+        share, mean, stderr = self.samples.along(scaled)
+        # Of a bent valley the mean over the sets is not the one of the straight line.
+        return share, mean + float(direction @ self.values - scaled @ self.samples.mean), stderr
+
     def label(self, group: int) -> Candidate:
         """A candidate that stands for a group."""
         return self.space.candidates[self.members[group][0]]
