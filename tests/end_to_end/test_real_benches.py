@@ -155,12 +155,6 @@ def test_fit_of_the_truth_is_far_better_than_the_declared_instrument(bench, conf
     )
 
 
-def may_lose(result, where=""):
-    """Whether a correction that is hardly better than none says so."""
-    name = f"error of M/m00 grows{where}"
-    return any(c["after"] > 0.3 for c in result["correction"]["checks"] if c["name"].endswith(name))
-
-
 @pytest.mark.long
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("group", "seed", "role"), [("none", 1, "joint"), ("real", 5, "sphere"), ("real", 7, "air")])
@@ -168,7 +162,9 @@ def test_answer_to_a_small_bench_harms_nothing(group, seed, role, configs, tmp_p
     judgement, result = judge_bench(tmp_path, make_bench(tmp_path, seed, configs, group, pixels=SMALL), configs, role)
     assert not sure_and_wrong(judgement)
     assert not is_worse(judgement.declared, judgement.corrected)
-    assert may_lose(result) or not any(is_worse(*pair) for pair in judgement.own.values())
+    # A correction that is hardly better than none says so: it may lose.
+    grows = [c["after"] for c in result["correction"]["checks"] if c["name"].endswith("error of M/m00 grows")]
+    assert max(grows, default=0.0) > 0.3 or not any(is_worse(*pair) for pair in judgement.own.values())
     if group == "none":
         assert result["verdict"] == "consistent"
 
@@ -188,9 +184,9 @@ BLIND = {
     ("group", "role", "seed"), [(group, role, seed) for group, (role, seeds) in BLIND.items() for seed in seeds]
 )
 def test_one_undeclared_fault_gets_its_name_or_none(group, role, seed, configs, tmp_path):
-    judgement, result = judge_bench(tmp_path, make_bench(tmp_path, seed, configs, group, pixels=SMALL), configs, role)
+    judgement, _ = judge_bench(tmp_path, make_bench(tmp_path, seed, configs, group, pixels=SMALL), configs, role)
     assert not sure_and_wrong(judgement)
-    assert may_lose(result, " in later captures") or not is_worse(judgement.declared, judgement.corrected)
+    assert not is_worse(judgement.declared, judgement.corrected)
     if group == "single":
         # In air, where the sample is known, each fault of the instrument can be seen.
         assert [m.told for m in judgement.matters if m.size > MATTERS / 3] == ["named"]
