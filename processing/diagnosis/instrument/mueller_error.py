@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.search.decision import PredictedChange, chance_checks, predicted_change
+from processing.diagnosis.search.decision import Along, PredictedChange, chance_checks, predicted_change
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.range_of import RANK
@@ -108,7 +108,7 @@ class MuellerErrors:
     space : candidates that may move M; values (K,), covariance (K, K) : of the posterior.
     products : (16, K, K) of the slopes of each element of M/m00, mean over elements and captures.
     of_captures : of each capture, the values that act on it and products (J, J) of their slopes.
-    posterior, index : of which these are the values (K,).
+    along : distribution of a sum of the values with weights (K,), in each set of causes; None: it is normal.
     """
 
     space: Space
@@ -116,8 +116,7 @@ class MuellerErrors:
     covariance: Array
     products: Array
     of_captures: tuple[tuple[NDArray[np.int64], Array], ...]
-    posterior: Posterior
-    index: NDArray[np.int64]
+    along: Along | None = None
 
     @classmethod
     def of(cls, problem: InstrumentProblem, posterior: Posterior, solved: Solution) -> MuellerErrors:
@@ -130,7 +129,8 @@ class MuellerErrors:
         for acting, part in mueller_slopes(problem, space, values, _residual_rms(problem, solved)):
             products[:, acting[:, None], acting] += part / captures
             each.append((acting, part.sum(axis=0)))
-        return cls(space, values, posterior.covariance[np.ix_(index, index)], products, tuple(each), posterior, index)
+        along = partial(_along_some, posterior.along, index, posterior.values.size)
+        return cls(space, values, posterior.covariance[np.ix_(index, index)], products, tuple(each), along)
 
     def corrected_values(self, used: Solution) -> Array:
         """Values (K,) that a correction applies."""
@@ -147,12 +147,8 @@ class MuellerErrors:
         )
 
     def _change(self, index: NDArray[np.int64], correction: Array, products: Array) -> PredictedChange:
-        def along(weights: Array) -> tuple[Array, Array, Array]:
-            of_all = np.zeros(self.posterior.values.size)
-            of_all[self.index[index]] = weights
-            return self.posterior.along(of_all)
-
-        covariance = self.covariance[np.ix_(index, index)]
+        covariance, size = self.covariance[np.ix_(index, index)], self.values.size
+        along = None if self.along is None else partial(_along_some, self.along, index, size)
         return predicted_change(correction[index], self.values[index], covariance, products, along=along)
 
     def uncertain(self, problem: InstrumentProblem, used: Solution) -> tuple[SystematicError, MuellerError] | None:
@@ -186,6 +182,13 @@ class MuellerErrors:
         most = self.space.candidates[int(np.argmax(alone))].short
         elements = tuple(map(float, np.sqrt(np.maximum(of_elements, 0.0))))
         return stored, MuellerError(elements=elements, rms=rms, most=most)
+
+
+def _along_some(along: Along, index: NDArray[np.int64], size: int, weights: Array) -> tuple[Array, Array, Array]:
+    """`along` of a sum of some values, at an `index` (J,) among `size`, with weights (J,)."""
+    of_all = np.zeros(size)
+    of_all[index] = weights
+    return along(of_all)
 
 
 def _residual_rms(problem: InstrumentProblem, solved: Solution) -> Array:
