@@ -9,8 +9,10 @@ from bench_capture import bench_capture, read
 from processing.diagnosis.captures.screening import without_steep_pixels
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.search.fit import Fit, Solution, held_out, minimize, prior
 from processing.diagnosis.search.rules import NEEDED
 from processing.diagnosis.search.space import Space
+from processing.diagnosis.verdict.answer import checks
 from simulators.blind.undeclared_captures import TrueBench
 
 SIDE = 24
@@ -103,3 +105,20 @@ def test_pixels_at_an_edge_are_left_out_and_those_of_a_slope_are_not(configs, tm
     # All edges: there is nothing else to look at than the flattest quarter.
     stripes = 0.2 + 0.4 * np.arange(SIDE) / SIDE * (np.arange(SIDE) % 2)
     assert left(stripes).usable.mean() == pytest.approx(0.25, abs=0.05)
+
+
+@pytest.mark.parametrize("bend", [-0.1, 0.1])
+def test_a_bend_that_held_out_data_do_not_have_changes_no_residual(bend, configs, tmp_path):
+    """Fits to a half of the image undo another bend than the fit to all, which stretches noise and residual alike."""
+    model, data = captured(tmp_path, configs, TrueBench(rows=SIDE, columns=SIDE, electrons=6000.0))
+    problem = InstrumentProblem(model, [data], folds=2)
+    base, space = Space(()), Space(tuple(c for c in problem.pool() if c.kind == "detector_nonlinearity"))
+    straight = minimize(problem, base, np.zeros(0))
+    before = held_out(problem, base, straight)
+    problem.relinearize(space, np.array([bend]))
+    sums = problem.sums(space, np.array([bend]))
+    bent = Fit(np.array([bend]), sums, float(sums.excess.sum()))
+    solved = Solution(base, straight, before, space, bent, held_out(problem, space, bent), prior(space))
+    residual = checks(problem, solved)[0]
+    assert residual.holds
+    assert residual.after == pytest.approx(residual.before, rel=2e-3)

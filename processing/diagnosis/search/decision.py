@@ -14,18 +14,17 @@ from scipy.special import ndtr
 from processing.arrays import Array
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.range_of import NEARLY_ZERO
-from processing.diagnosis.search.result import Check, Verdict
+from processing.diagnosis.search.result import Check, Error, Verdict
 from processing.diagnosis.search.rules import CHANCE_WORSE, LEAST_CHANGE, LIMIT, LIMIT_OF_TWO, WORSE, WORSE_CONDITION
 
 
-def held_out_check(solved: Solution, stretch: float = 1.0) -> Check:
-    """The residual on held-out data, percent; `stretch` is by how much a correction of the counts widens them."""
-    before, after = 100 * solved.before.rms, 100 * solved.after.rms / stretch
+def held_out_check(before: Error, after: Error) -> Check:
+    """The residual on held-out data, percent."""
     return Check(
         name="rms on held-out data, percent of the mean signal",
-        before=before,
-        after=after,
-        holds=bool(after <= WORSE * before),
+        before=before.rms_percent,
+        after=after.rms_percent,
+        holds=bool(after.rms_percent <= WORSE * before.rms_percent),
     )
 
 

@@ -81,10 +81,13 @@ def combinations(posterior: Posterior, solved: Solution) -> tuple[Combination, .
 
 
 def error(problem: Problem, solved: Solution, held_out: HeldOut, k: int | None = None) -> Error:
-    """A residual as it is told, of one capture `k` or of all, in the unit of the counts as they were taken."""
+    """A residual as it is told, of one capture `k` or of all, in the unit of the counts as they were taken.
+
+    Counts that a correction bends have another noise, so of known noise the residual is a multiple of it.
+    """
     noise, rms, beyond = floor(problem, solved, k), 100 * held_out.rms, None
     if noise is not None:
-        rms /= 1.0 if held_out is solved.before else stretch(problem, solved, k)
+        rms = noise * float(np.sqrt(held_out.chi2_reduced))
         beyond = BeyondNoise.of(held_out.excess, held_out.freedom, noise)
     return Error(rms_percent=rms, chi2_reduced=held_out.chi2_reduced, held_out=problem.held_out, beyond_noise=beyond)
 
@@ -94,14 +97,6 @@ def floor(problem: Problem, solved: Solution, k: int | None = None) -> float | N
     if not problem.noise_known:
         return None
     return 100 * problem.noise_floor(solved.base, solved.before_fit.values, k)
-
-
-def stretch(problem: Problem, solved: Solution, k: int | None = None) -> float:
-    """By how much a bend of the response that is undone stretches noise, and residual, relative to the signal."""
-    if not problem.noise_known:
-        return 1.0
-    before = problem.noise_floor(solved.base, solved.before_fit.values, k)
-    return problem.noise_floor(solved.space, solved.fit.values, k) / before if before > 0 else 1.0
 
 
 def held_out_without(problem: Problem, solved: Solution, effects: Collection[Candidate]) -> HeldOut:
@@ -219,12 +214,13 @@ def unobservable(problem: Problem, posterior: Posterior) -> list[Candidate]:
 
 def checks(problem: Problem, solved: Solution) -> tuple[Check, ...]:
     """Held-out residual, rank and condition of W, before and after: if one gets worse, it is no explanation."""
-    figures = [held_out_check(solved, stretch(problem, solved))]
+    held_out = solved.before, solved.after
+    figures = [held_out_check(*(error(problem, solved, part) for part in held_out))]
     several, rows = len(problem.captures) > 1, []
     for k, data in enumerate(problem.captures):
         if several:
             # The sum decides; what became of each is told also where nothing is written.
-            old, new = (100 * held_out.of(k).rms for held_out in (solved.before, solved.after))
+            old, new = (error(problem, solved, part.of(k), k).rms_percent for part in held_out)
             name = f"rms on held-out data of {data.name} at {data.wavelength_nm:g} nm, percent"
             figures.append(Check(name=name, before=old, after=new, holds=True))
         where = f"{data.name} at {data.wavelength_nm:g} nm" if several else data.name
