@@ -20,6 +20,8 @@ TIMES = {"host_time_s", "camera_time_ns", "frame_id", "start_time", "closing/jso
 #: How HDF5 keeps dimension scales: references, which differ from file to file.
 LINKS = {"DIMENSION_LIST", "REFERENCE_LIST"}
 TIMES |= {"segments/json", "states/segment", "states/crc32"}
+#: A dark and 18 poses: what `run_with` takes unless its test says otherwise.
+SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -137,9 +139,18 @@ def intact(configs: Path) -> Callable[[Path], int]:
 
 
 @pytest.fixture
+def plan_file(tmp_path: Path) -> Path:
+    """The plan of `run_with` as a file, with smaller steps: for programs whose rig moves slowly."""
+    path = tmp_path / "plan.yaml"
+    path.write_text("kind: plan\nstates: {kind: rotating_retarders, states: 18, step_deg: 10, ratio: 4.91}\ndarks: 1\n")
+    return path
+
+
+@pytest.fixture
 def run_with(quick_rig: Callable[..., Path], tmp_path: Path) -> Callable[..., tuple[BaseException | None, Path]]:
     """Runs a capture in this process and does something to the rig when a state is about to be exposed.
 
+    The plan is `SHORT`, with the changes of `plan`.
     `act(rig, state, retake)` is called before each exposure. Returns the error that ended the run, or None, and the
     file, partial or not.
     """
@@ -165,7 +176,7 @@ def run_with(quick_rig: Callable[..., Path], tmp_path: Path) -> Callable[..., tu
         **simulator: object,
     ) -> tuple[BaseException | None, Path]:
         config = load_rig(quick_rig(top=top, **simulator))
-        job = prepare(MeasurementPlan().with_changes(**(plan or {})), config)
+        job = prepare(MeasurementPlan().with_changes(**(SHORT | (plan or {}))), config)
         folder = tmp_path / f"capture{next(numbers)}" if resume is None else resume.parent
         error: BaseException | None = None
         with disc_process(), open_rig(config) as rig:

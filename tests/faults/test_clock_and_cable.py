@@ -17,8 +17,6 @@ from drivers.errors import DeviceError
 from processing.storage.captures.capture import Capture
 from simulators.serial.reply_faults import parse_fault
 
-SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
-
 
 def _messages(path):
     with Capture(path) as capture:
@@ -63,7 +61,7 @@ def test_a_clock_that_is_set_in_mid_run_leaves_order_and_frames_right(run_with, 
         if state == 7 and retake == 0:
             clocks.set_s = step_s
 
-    error, path = run_with(set_clock, plan=SHORT, top={"retakes": 5})
+    error, path = run_with(set_clock, top={"retakes": 5})
     assert error is None
     assert intact(path) == 19
     with Capture(path) as capture:
@@ -91,7 +89,7 @@ def test_a_machine_that_slept_takes_the_state_again(run_with, intact, monkeypatc
 
             rig.camera._do_trigger = slept
 
-    error, path = run_with(sleep, plan=SHORT, top={"retakes": 5})
+    error, path = run_with(sleep, top={"retakes": 5})
     assert error is None
     assert visits.count(7) > 1
     assert intact(path) == 19
@@ -132,10 +130,10 @@ def test_an_optic_that_slips_on_its_shaft_is_told_by_the_repeated_state(run_with
             # The next command slips it; every encoder agrees with every target afterwards.
             rig.simulation.emulators["rotators"].faults.add(parse_fault("slip:20"))
 
-    error, path = run_with(slip, plan=SHORT | {"repeat_first": True})
+    error, path = run_with(slip, plan={"repeat_first": True})
     assert error is None
     assert "an optic slipped although its encoder agrees" in _messages(path)
-    error, path = run_with(plan=SHORT | {"repeat_first": True})
+    error, path = run_with(plan={"repeat_first": True})
     assert error is None
     assert "repeats the pose" not in _messages(path)
 
@@ -163,7 +161,7 @@ def test_a_shutter_that_sticks_open_and_says_so_is_told(run_with):
             rig.simulation.emulators["shutter"].faults.add(parse_fault("stuck"))
 
     # The states are whole; that the light could not be shut off at their end is in the file.
-    error, path = run_with(stick, plan=SHORT | {"darks": 2})
+    error, path = run_with(stick, plan={"darks": 2})
     assert error is None
     assert "blade is still" in _messages(path)
 
@@ -177,7 +175,7 @@ def test_a_shutter_that_sticks_and_says_it_does_not_is_found_by_the_darks(run_wi
             rig.source.set_light(light)
             rig.simulation.emulators["shutter"].faults.add(parse_fault("jammed"))
 
-    error, path = run_with(stick, plan=SHORT | {"darks": 2})
+    error, path = run_with(stick, plan={"darks": 2})
     assert isinstance(error, RunFailed)
     assert "dark states" in str(error)
     assert path.name.endswith(".partial")
@@ -191,7 +189,7 @@ def test_lit_darks_of_a_run_that_was_cut_are_found_when_it_goes_on(run_with):
         if state == 4:
             raise RunFailed("cut before there is a bright state")
 
-    plan = SHORT | {"darks": 2}
+    plan = {"darks": 2}
     _, path = run_with(stick, plan=plan)
     with Capture(path) as capture:
         assert "dark" in capture.role
@@ -209,7 +207,7 @@ def test_a_cable_that_is_pulled_ends_the_run_and_plugged_again_it_goes_on(run_wi
         if state == 6:
             rig.simulation._ports[line].close()
 
-    error, path = run_with(pull, plan=SHORT)
+    error, path = run_with(pull)
     if error is None:
         # Nothing was asked of that line any more but to shut off the light.
         assert line == "shutter"
@@ -220,6 +218,6 @@ def test_a_cable_that_is_pulled_ends_the_run_and_plugged_again_it_goes_on(run_wi
     before = intact(path)
     assert 5 <= before < 19
     # Plugged in again, the device is found anew; it lost its reference with its power, and is homed.
-    error, final = run_with(resume=path, plan=SHORT)
+    error, final = run_with(resume=path)
     assert error is None
     assert intact(final) == 19

@@ -58,9 +58,11 @@ def _until(condition, child=None):
 
 
 @pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGSTOP])
-def test_killed_or_frozen_the_light_is_shut_and_the_axes_stop(kind, spawn, partial_of, served, intact, tmp_path):
+def test_killed_or_frozen_the_light_is_shut_and_the_axes_stop(
+    kind, spawn, partial_of, plan_file, served, intact, tmp_path
+):
     simulation, rig, alarms = served
-    child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out")
+    child = spawn("--omega", 35, "--plan", plan_file, "--rig", rig, "--out", tmp_path / "out")
     partial = partial_of(tmp_path / "out", child, states=5)
     _until(lambda: _lit(simulation) and _moving(simulation), child)
     child.send_signal(kind)
@@ -113,9 +115,9 @@ def test_no_light_before_a_guard_watches_and_the_light_goes_off_with_the_guard(w
     assert "stopped or silent" in news
 
 
-def test_a_capture_survives_its_guard(spawn, partial_of, served, intact, tmp_path):
+def test_a_capture_survives_its_guard(spawn, partial_of, plan_file, served, intact, tmp_path):
     rig = served[1]
-    child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out")
+    child = spawn("--omega", 35, "--plan", plan_file, "--rig", rig, "--out", tmp_path / "out")
     partial_of(tmp_path / "out", child, states=5)
     (guard,) = _guards_of(child.pid)
     os.kill(guard, signal.SIGKILL)
@@ -123,7 +125,7 @@ def test_a_capture_survives_its_guard(spawn, partial_of, served, intact, tmp_pat
     assert child.returncode == 0, err
     assert "the guard was lost (it was killed by signal 9)" in err
     (path,) = (tmp_path / "out").glob("*.h5")
-    assert intact(path) == 44
+    assert intact(path) == 19
     with Capture(path) as capture:
         assert any("the guard was lost" in text for text in capture.closing["messages"])
     assert "guard restarted" in (tmp_path / "out" / "guard.jsonl").read_text()
@@ -136,12 +138,12 @@ def _guards_of(pid):
 
 
 @pytest.mark.parametrize("fault", ["silent", "garbled"])
-def test_a_light_that_acquire_cannot_shut_is_shut_by_the_guard(spawn, partial_of, served, tmp_path, fault):
+def test_a_light_that_acquire_cannot_shut_is_shut_by_the_guard(spawn, partial_of, plan_file, served, tmp_path, fault):
     """The shutter's line answers with noise or nothing; when it is well again the guard shuts the light."""
     simulation, rig, alarm_file = served
     config = load_rig(rig)
     rig.write_text(dump_yaml(config.model_copy(update={"source": config.source.model_copy(update={"reply_s": 1.0})})))
-    child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out")
+    child = spawn("--omega", 35, "--plan", plan_file, "--rig", rig, "--out", tmp_path / "out")
     partial_of(tmp_path / "out", child, states=5)
     _until(lambda: _lit(simulation), child)
     shutter = simulation.emulators["shutter"]
@@ -161,12 +163,14 @@ def test_a_light_that_acquire_cannot_shut_is_shut_by_the_guard(spawn, partial_of
 
 
 @pytest.mark.parametrize(("port", "fault"), [("rotators", "garbled"), ("arm", "silent")])
-def test_an_axis_whose_stop_is_not_confirmed_is_stopped_by_the_guard(spawn, partial_of, served, tmp_path, port, fault):
+def test_an_axis_whose_stop_is_not_confirmed_is_stopped_by_the_guard(
+    spawn, partial_of, plan_file, served, tmp_path, port, fault
+):
     simulation, rig, alarm_file = served
     config = load_rig(rig)
     axes = {name: entry.model_copy(update={"reply_s": 1.0}) for name, entry in config.axes.items()}
     rig.write_text(dump_yaml(config.model_copy(update={"axes": axes})))
-    child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out")
+    child = spawn("--omega", 35, "--plan", plan_file, "--rig", rig, "--out", tmp_path / "out")
     partial_of(tmp_path / "out", child, states=5)
     _until(lambda: _lit(simulation), child)
     line = simulation.emulators[port]

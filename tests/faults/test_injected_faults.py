@@ -20,7 +20,6 @@ from drivers.errors import DeviceError
 from drivers.motion import MotionAxis
 from drivers.serial_link import SerialLink
 
-SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
 #: Where a call leaves the program, what it may raise, and how often a run makes it, roughly.
 CALLS = {
     "serial write": (SerialLink, "write", (MemoryError, KeyError), 200),
@@ -77,7 +76,7 @@ def test_after_any_failure_the_light_is_off_and_the_capture_goes_on(run_with, in
                 for each in injected:
                     each.arm(True)
 
-            error, path = run_with(arm, plan=SHORT)
+            error, path = run_with(arm)
             for each in injected:
                 each.arm(False)
         assert error is None or isinstance(error, AcquisitionError | DeviceError), error
@@ -86,7 +85,7 @@ def test_after_any_failure_the_light_is_off_and_the_capture_goes_on(run_with, in
             assert not rigs[0].simulation.light(), (kinds, error)
         intact(path)
         if error is not None:
-            error, path = run_with(resume=path, plan=SHORT)
+            error, path = run_with(resume=path)
             assert error is None
         assert intact(path) == 19
 

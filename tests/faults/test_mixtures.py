@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import h5py
 import pytest
-from ruamel.yaml import YAML
 
 from acquisition.capture.identity import devices_of, require_same_devices
 from acquisition.capture.job import job_of
@@ -19,8 +18,6 @@ from processing.reduction.counts_to_signal import CountCorrection
 from processing.reports.report import write_report
 from processing.storage.captures.capture import Capture
 from tests.rig_files import with_values
-
-SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
 
 
 def broken_at(number):
@@ -38,7 +35,7 @@ TAKEN = {}
 @pytest.fixture
 def partial(run_with, tmp_path):
     if not TAKEN:
-        error, path = run_with(broken_at(6), plan=SHORT)
+        error, path = run_with(broken_at(6))
         assert isinstance(error, DeviceError)
         assert path.name == "run.h5.partial"
         TAKEN["bytes"] = path.read_bytes()
@@ -91,7 +88,7 @@ def test_an_edited_instrument_or_scene_is_refused(run_with, configs, tmp_path):
     model, scene = folder / "instruments" / "rgb950.yaml", folder / "scenes" / "red_sphere.yaml"
     material = folder / "materials" / "red_print.yaml"
     modes = {"drr": {"instrument": str(model)}}
-    _, path = run_with(broken_at(4), plan=SHORT, top={"modes": modes}, samples={"red_sphere": str(scene)})
+    _, path = run_with(broken_at(4), top={"modes": modes}, samples={"red_sphere": str(scene)})
     job_of(path)
     named = "content of the file.simulator.samples.red_sphere"
     for file, words in ((model, "instrument."), (scene, named), (material, f"{named}.material")):
@@ -155,10 +152,10 @@ def test_a_resume_is_a_recorded_segment_and_nothing_is_forgotten(run_with, tmp_p
         if state == 4:
             rig.simulation.emulators["shutter"].trip(True)
 
-    error, path = run_with(door, plan=SHORT)
+    error, path = run_with(door)
     assert "the door is open" in str(error)
     assert_ends_with_its_text(path)
-    error, final = run_with(resume=path, plan=SHORT)
+    error, final = run_with(resume=path)
     assert error is None
     assert_ends_with_its_text(final)
     with Capture(final) as capture:
@@ -186,18 +183,18 @@ def test_a_resume_is_a_recorded_segment_and_nothing_is_forgotten(run_with, tmp_p
 
 def test_the_lamp_is_held_against_the_light_before_the_resume(run_with):
     top = {"interlocks": [{"kind": "lamp", "limit": 0.5}]}
-    _, path = run_with(broken_at(6), plan=SHORT, top=top)
-    error, path = run_with(resume=path, plan=SHORT, top=top, flux_e_per_s=8e4)
+    _, path = run_with(broken_at(6), top=top)
+    error, path = run_with(resume=path, top=top, flux_e_per_s=8e4)
     assert "of that of the first state" in str(error)
 
 
-def test_a_capture_begun_in_the_same_second_gets_the_next_name(acquire, quick_rig, intact, monkeypatch, tmp_path):
-    plan = tmp_path / "plan.yaml"
-    YAML().dump({"omega_deg": 35} | SHORT, plan)
+def test_a_capture_begun_in_the_same_second_gets_the_next_name(
+    acquire, quick_rig, plan_file, intact, monkeypatch, tmp_path
+):
     monkeypatch.setattr("acquisition.commands.single.default_name", lambda plan: "same.h5")
     (tmp_path / "out").mkdir()
     (tmp_path / "out/same.h5").write_bytes(b"of this second")
-    out = acquire.made("--plan", plan, "--rig", quick_rig(), "--out", tmp_path / "out")
+    out = acquire.made("--omega", 35, "--plan", plan_file, "--rig", quick_rig(), "--out", tmp_path / "out")
     assert "same-2.h5" in out
     assert intact(tmp_path / "out/same-2.h5") == 19
     assert (tmp_path / "out/same.h5").read_bytes() == b"of this second"

@@ -8,11 +8,9 @@ from acquisition.capture.state_file import StateFile
 from acquisition.errors import AcquisitionError
 from processing.storage.captures.capture import Capture
 
-SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
-
 
 def test_a_compressed_capture_is_the_same_capture(run_with, acquire, tmp_path):
-    _, path = run_with(plan=SHORT)
+    _, path = run_with()
     with Capture(path) as capture:
         frames = [capture.frames(k) for k in range(len(capture.done))]
         was = capture.header, capture.closing, capture.segments, capture.column("crc32")
@@ -34,7 +32,7 @@ def test_a_compressed_capture_is_the_same_capture(run_with, acquire, tmp_path):
 
 
 def test_a_damaged_capture_stays_as_it_is(run_with, acquire):
-    _, path = run_with(plan=SHORT)
+    _, path = run_with()
     with h5py.File(path, "r+") as h5:
         h5["entry/instrument/detector/data"][3, 0, 0, 0] ^= 1
     raw = path.read_bytes()

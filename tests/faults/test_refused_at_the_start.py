@@ -13,28 +13,28 @@ from processing.storage.captures.capture import Capture
 from simulators.rig.served_rig import serve
 
 
-def test_disc_too_small_is_refused_before_any_motion(spawn, quick_rig, tmp_path):
+def test_disc_too_small_is_refused_before_any_motion(spawn, plan_file, quick_rig, tmp_path):
     rig = quick_rig()
 
     def starve():
         # A limit on the size of files: what a full disc looks like to the program.
         resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
 
-    child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out", preexec_fn=starve)
+    child = spawn("--omega", 35, "--plan", plan_file, "--rig", rig, "--out", tmp_path / "out", preexec_fn=starve)
     out, err = child.communicate()
     assert child.returncode == 1, out + err
-    needed = bytes_needed(44, 1, (64, 80))
+    needed = bytes_needed(19, 1, (64, 80))
     assert f"needs {needed:,} bytes" in err
     assert "Nothing was moved" in err
     assert "homing" not in err
     assert not list((tmp_path / "out").glob("*"))
 
 
-def test_second_program_is_refused_with_the_name_of_the_first(spawn, partial_of, quick_rig, tmp_path):
+def test_second_program_is_refused_with_the_name_of_the_first(spawn, partial_of, plan_file, quick_rig, tmp_path):
     with serve(quick_rig("behind.yaml", clock_speed=2), tmp_path / "rig.yaml", "red_sphere"):
-        first = spawn("--omega", 35, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "first")
+        first = spawn("--omega", 35, "--plan", plan_file, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "first")
         partial_of(tmp_path / "first", first, states=2)
-        second = spawn("--omega", 35, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "second")
+        second = spawn("--omega", 35, "--plan", plan_file, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "second")
         _, err = second.communicate()
         assert second.returncode == 1
         assert f"pid {first.pid}" in err
@@ -44,23 +44,25 @@ def test_second_program_is_refused_with_the_name_of_the_first(spawn, partial_of,
         assert first.returncode == 0, err
 
 
-def test_a_rig_served_by_the_command_line_takes_a_capture(quick_rig, acquire, intact, tmp_path):
+def test_a_rig_served_by_the_command_line_takes_a_capture(quick_rig, plan_file, acquire, intact, tmp_path):
     """Emulators in a program of their own: the drivers see ports and an address, nothing else."""
     command = [sys.executable, "-m", "simulators.cli", "rig", quick_rig("behind.yaml"), "--out", tmp_path / "rig.yaml"]
     server = subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, text=True)
     try:
         assert server.stdout.readline().strip() == str(tmp_path / "rig.yaml")
         assert "sim:" not in (tmp_path / "rig.yaml").read_text()
-        out = acquire.made("--omega", 35, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "out")
+        out = acquire.made(
+            "--omega", 35, "--plan", plan_file, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "out"
+        )
         assert "SIMULATED" in out
-        assert intact(next((tmp_path / "out").glob("*.h5"))) == 44
+        assert intact(next((tmp_path / "out").glob("*.h5"))) == 19
     finally:
         server.terminate()
         server.communicate()
 
 
-def test_a_capture_that_is_being_written_cannot_be_resumed(spawn, partial_of, quick_rig, acquire, tmp_path):
-    child = spawn("--omega", 35, "--rig", quick_rig(), "--out", tmp_path / "out")
+def test_a_capture_that_is_being_written_cannot_be_resumed(spawn, partial_of, plan_file, quick_rig, acquire, tmp_path):
+    child = spawn("--omega", 35, "--plan", plan_file, "--rig", quick_rig(), "--out", tmp_path / "out")
     partial = partial_of(tmp_path / "out", child, states=2)
     code, _, err = acquire("--resume", partial)
     assert code != 0

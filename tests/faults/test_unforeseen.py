@@ -13,8 +13,6 @@ from acquisition.disc import disc
 from acquisition.errors import Unforeseen
 from processing.storage.captures.capture import Capture
 
-SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
-
 
 def test_an_error_that_nobody_foresaw_is_recorded_and_the_capture_goes_on(run_with, intact):
     rigs = []
@@ -24,7 +22,7 @@ def test_an_error_that_nobody_foresaw_is_recorded_and_the_capture_goes_on(run_wi
         if state == 5:
             raise ValueError("injected")
 
-    error, path = run_with(act, plan=SHORT)
+    error, path = run_with(act)
     assert isinstance(error, Unforeseen)
     assert "ValueError" in str(error)
     assert path.name == "run.h5.partial"
@@ -33,7 +31,7 @@ def test_an_error_that_nobody_foresaw_is_recorded_and_the_capture_goes_on(run_wi
         assert capture.status == "failed"
         assert "injected" in capture.closing["failure"]
         assert "test_unforeseen.py" in capture.closing["traceback"]
-    error, final = run_with(resume=path, plan=SHORT)
+    error, final = run_with(resume=path)
     assert error is None
     assert intact(final) == 19
 

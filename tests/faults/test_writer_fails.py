@@ -16,8 +16,6 @@ from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
 from processing.storage.captures.capture import Capture, CaptureError
 
-SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
-
 
 def _failing_at(monkeypatch, number, fail):
     write = StateFile.write_state
@@ -39,13 +37,13 @@ def test_any_exception_in_the_writer_ends_the_run_and_it_goes_on(run_with, intac
     light = []
     with monkeypatch.context() as patch:
         _failing_at(patch, 5, lambda: _raise(kind))
-        error, path = run_with(lambda rig, *_: light.append(rig), plan=SHORT)
+        error, path = run_with(lambda rig, *_: light.append(rig))
     assert isinstance(error, AcquisitionError)
     assert "injected" in str(error)
     assert path.name == "run.h5.partial"
     assert intact(path) == 5
     assert not light[0].simulation.light()
-    error, final = run_with(resume=path, plan=SHORT)
+    error, final = run_with(resume=path)
     assert error is None
     assert intact(final) == 19
 
@@ -62,7 +60,7 @@ def test_a_disc_that_takes_nothing_shuts_the_light_and_ends_the_run(run_with, in
     monkeypatch.setattr(CaptureRunner, "_set_light", _then(CaptureRunner._set_light, lambda: lit.append("set")))
     with monkeypatch.context() as patch:
         _failing_at(patch, 5, lambda: blocked.wait(60))
-        error, path = run_with(lambda rig, *_: rigs.append(rig), plan=SHORT, observers=(Told(),))
+        error, path = run_with(lambda rig, *_: rigs.append(rig), observers=(Told(),))
     assert "the disc has not taken a state for 1 s" in str(error)
     failures = [number for number, entry in enumerate(lit) if "the disc takes no data" in str(entry)]
     # The light comes before the words, not at the end of the run.
@@ -87,7 +85,7 @@ def test_a_run_stopped_at_once_does_not_wait_for_a_disc_that_blocks(run_with, mo
 
     _failing_at(monkeypatch, 5, blocked.wait)
     with pytest.raises(KeyboardInterrupt) as stopped:
-        run_with(plan=SHORT, observers=(Twice(),))
+        run_with(observers=(Twice(),))
     blocked.set()
     assert any("the end of the run could not be recorded" in note for note in stopped.value.__notes__)
 
@@ -110,7 +108,7 @@ def test_a_disc_that_comes_back_is_waited_for(run_with, intact, monkeypatch):
                 back.set()
 
     _failing_at(monkeypatch, 5, lambda: back.wait(60))
-    error, path = run_with(plan=SHORT, observers=(Told(),))
+    error, path = run_with(observers=(Told(),))
     assert error is None
     assert intact(path) == 19
     with Capture(path) as capture:
@@ -145,7 +143,7 @@ def test_every_ctrl_c_after_the_second_interrupts_too():
 
 
 def test_a_damaged_partial_file_is_refused_in_a_line(run_with, acquire, tmp_path):
-    _, path = run_with(plan=SHORT)
+    _, path = run_with()
     for name in ("entry/states/frame_id", "entry/instrument/psa/value", "entry/segments", "entry/closing/json"):
         damaged = tmp_path / "damaged.h5.partial"
         damaged.write_bytes(path.read_bytes())
@@ -160,7 +158,7 @@ def test_a_damaged_partial_file_is_refused_in_a_line(run_with, acquire, tmp_path
 
 
 def test_a_byte_changed_on_the_disc_is_found_at_reading(run_with):
-    _, path = run_with(plan=SHORT)
+    _, path = run_with()
     content = path.read_bytes()
     with Capture(path) as capture:
         assert capture.checked
@@ -196,7 +194,7 @@ def test_a_folder_deleted_in_mid_run_is_noticed_with_the_next_state(run_with, tm
 
     with pytest.raises(StopIteration):
         # Nothing of that name is left, which the fixture looks for.
-        run_with(delete, plan=SHORT)
+        run_with(delete)
     assert max(visits) <= 7
     with Capture(tmp_path / "moved.h5") as capture:
         assert 4 <= len(capture.done) <= 6
@@ -214,7 +212,7 @@ def test_a_layout_that_a_disc_has_lost_is_no_capture(run_with, monkeypatch, tmp_
     monkeypatch.setattr(partial_file, "put_layout", lose)
     moved = []
     with pytest.raises(StopIteration):
-        run_with(lambda *_: moved.append(1), plan=SHORT)
+        run_with(lambda *_: moved.append(1))
     assert not moved
     assert not list(tmp_path.glob("capture*/run.h5*"))
 
@@ -249,8 +247,8 @@ def test_captures_leave_no_thread_and_no_descriptor(run_with):
     def held():
         return len(list(Path("/proc/self/fd").iterdir())), sorted(thread.name for thread in threading.enumerate())
 
-    run_with(plan=SHORT)
+    run_with()
     before = held()
     for _ in range(2):
-        run_with(plan=SHORT)
+        run_with()
     assert held() == before
