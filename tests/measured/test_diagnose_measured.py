@@ -54,7 +54,7 @@ def wollaston(public_files, folder: Path, instrument: Path, wavelength_nm: int) 
         (1200, 0.2, 0.27, {"psg_extinction"}),
         # A value for each intensity would leave 0.001 %, which says nothing.
         (1300, 0.1, 0.25, set()),
-        (1950, 0.2, 0.45, {"generator_ellipticity"}),
+        pytest.param(1950, 0.2, 0.45, {"generator_ellipticity"}, marks=pytest.mark.long),
     ],
 )
 def test_wollaston_at_other_wavelengths(public_files, configs, tmp_path, wavelength_nm, least, most, sure):
@@ -158,7 +158,11 @@ def test_ten_wavelengths_share_their_mechanics(public_files, configs, tmp_path):
 # One row of the table has a noise of 0.75, 0.81 and 1.20 %; a mean of eleven (20 nm) has a third of it.
 @pytest.mark.parametrize(
     ("wavelength_nm", "before", "after"),
-    [pytest.param(450, 1.5, 0.6, marks=pytest.mark.long), (850, 0.8, 0.55), (1000, 2.0, 1.2)],
+    [
+        pytest.param(450, 1.5, 0.6, marks=pytest.mark.long),
+        (850, 0.8, 0.55),
+        pytest.param(1000, 2.0, 1.2, marks=pytest.mark.long),
+    ],
 )
 def test_one_detector_behind_two_plates(public_files, configs, tmp_path, wavelength_nm, before, after):
     instrument = configs / "instruments/drr_single_detector.yaml"

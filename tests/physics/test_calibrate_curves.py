@@ -83,6 +83,7 @@ def test_curves_have_smaller_errors_than_values_at_each_wavelength(repeated):
             assert np.all(c.stderr[plates_only] < e.stderr[plates_only])
 
 
+@pytest.mark.long
 def test_error_bars_of_curves_are_those_of_the_noise(repeated):
     truth = np.array([true_values(nm) for nm in ELECTRONS])
     pulls = np.array(

@@ -30,10 +30,9 @@ def stokes():
     return parse_yaml(STOKES, InstrumentModel, "stokes.yaml")
 
 
-@pytest.mark.parametrize("states", [16, 24, 40])
-def test_free_angles_and_retardances_come_within_one_percent_of_the_bound(rgb950, states):
-    design = free_design(rgb950, states, free_retardances=True)
-    assert design.bound == pytest.approx(1600 / states)
+def test_free_angles_and_retardances_come_within_one_percent_of_the_bound(rgb950):
+    design = free_design(rgb950, 24, free_retardances=True)
+    assert design.bound == pytest.approx(1600 / 24)
     assert 1 <= design.variance / design.bound < 1.01
     assert list(design.retardances_deg.values()) == pytest.approx([131.8, 131.8], abs=1)
 

@@ -135,7 +135,6 @@ def test_a_black_level_that_drifts_is_no_bent_response(configs, tmp_path, bench)
     ("sentence", "values"),
     [
         ("diattenuation and diattenuation at 45 degrees of exit by 4 x hwp", [0.0, 0.004, 0.006, 0.0]),
-        ("retardance at 0 degrees and retardance at 45 degrees of exit", [0.0, 2.0]),
         ("circular diattenuation of exit over time", [0.02]),
     ],
 )

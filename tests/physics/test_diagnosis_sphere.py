@@ -52,8 +52,12 @@ def test_a_true_model_is_left_in_peace(scene, declared, tmp_path):
     assert d.error_before.chi2_reduced == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.parametrize("kind", ["registration", "illumination_azimuth", "analyzer_roll"])
-def test_what_is_wrong_gets_its_name(scene, declared, tmp_path, kind):
+@pytest.mark.parametrize(
+    ("instrument", "kind"),
+    [("rgb950", "registration"), ("rgb950", "illumination_azimuth"), ("linear_stokes", "analyzer_roll")],
+)
+def test_what_is_wrong_gets_its_name(scene, configs, tmp_path, instrument, kind):
+    declared = InstrumentModel.load(configs / f"instruments/{instrument}.yaml")
     fault = drawn(kind, np.random.default_rng(11), scene, declared)
     d, _ = diagnosed(tmp_path, fault, declared, scene)
     assert d.verdict == "explained"
@@ -158,7 +162,11 @@ def test_without_polarization_there_is_nothing_to_say(scene, configs, tmp_path):
 def test_derivatives_are_those_of_the_residual(scene, configs, tmp_path):
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     fault = drawn("polarized_diffuse", np.random.default_rng(1), scene, declared)
-    _, problem = diagnosed(tmp_path, fault, declared, scene)
+    path = tmp_path / "capture.h5"
+    take(path, fault, declared, NM, omega_deg=OMEGA_DEG, seed=1)
+    with Capture(path) as capture:
+        data = read_surface(capture, declared.at(NM), scene.object.geometry, fault.material)
+    problem = SurfaceProblem(declared.at(NM), [data])
     pool = [c for c in problem.pool() if isinstance(c.effect, ReflectanceEffect)]
     space = Space(tuple(pool))
     values = 0.5 * np.minimum(space.joined("typical"), space.joined("upper"))

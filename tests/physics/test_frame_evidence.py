@@ -95,6 +95,7 @@ def test_a_picture_upside_down_of_a_nearly_symmetric_sample_is_named_where_its_o
     assert named >= 6
 
 
+@pytest.mark.long
 def test_noise_does_not_hide_a_smooth_odd_part(rows):
     """With the noise of each pattern from its own 23 degrees of freedom, 42 of these 96 were named."""
     named = 0

@@ -240,8 +240,10 @@ def test_the_covariance_of_the_stokes_vector_is_that_of_its_scatter(sent_deg, no
     assert np.abs(np.triu(covariance, 1) / np.sqrt(np.outer(packed[:4], packed[:4]))).max() > 0.1
 
 
-@pytest.mark.parametrize("sent_deg", [None, 20.0])
-@pytest.mark.parametrize("vector", [(0, 0, 1.0), (0, 0, -0.3), (0.3, 0, 0), (0, 0.01, 0.005), (0, 0, 0)])
+@pytest.mark.parametrize(
+    ("vector", "sent_deg"),
+    [((0, 0, 1.0), None), ((0, 0, -0.3), 20.0), ((0.3, 0, 0), None), ((0, 0.01, 0.005), None), ((0, 0, 0), 20.0)],
+)
 def test_the_ellipticity_is_in_its_interval_for_any_light(vector, sent_deg, noisy, tmp_path):
     sample = np.zeros((4, 4))
     sample[:, 0] = 1, *vector

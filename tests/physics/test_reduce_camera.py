@@ -41,6 +41,7 @@ def test_gain_and_read_noise_are_found(gain: float, read: float, synthetic_captu
     assert line.chi_square < 2
 
 
+@pytest.mark.long
 def test_standard_error_of_the_gain_is_that_of_repetition(synthetic_capture) -> None:
     pulls = []
     for seed in range(40):

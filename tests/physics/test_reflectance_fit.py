@@ -79,8 +79,7 @@ def noisy(m: np.ndarray, w: np.ndarray, seed: int, electrons: float) -> tuple[np
     return p + np.random.default_rng(seed).normal(size=p.shape) * np.sqrt(variance), variance
 
 
-@pytest.mark.parametrize("electrons", [200, 20_000])
-@pytest.mark.parametrize("angles", [1, 4])
+@pytest.mark.parametrize(("angles", "electrons"), [(1, 200), (4, 20_000)])
 def test_a_mueller_image_gives_constants_without_noise_bias(sphere, angles, electrons):
     geometry, m = sphere
     chosen = np.s_[:380] if angles == 1 else np.s_[::3]
@@ -151,7 +150,7 @@ def test_unpolarized_light_does_not_pretend_to_tell_what_it_cannot(sphere):
 
 
 def test_standard_errors_of_a_stokes_fit_cover_the_truth(sphere):
-    geometry, m = sphere
+    geometry, m = sphere[0][::3], sphere[1][::3]
     pulls = []
     for seed in range(12):
         p, variance = noisy(m, stokes(VERTICAL), seed, 200_000)
@@ -239,7 +238,7 @@ def apart(m: np.ndarray, rng: np.random.Generator, size: float = 0.05) -> np.nda
     return m + m[:, :1, :1] * np.einsum("k,nkij->nij", [size / 2, 0.0, -size / 2], processes)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_stokes_image_does_not_claim_constants_that_small_eigenvalues_move(sphere, seed):
     """They vary over the surface: 0.7 % apart, they moved n from 1.30 to 1.16, at a stated error of 0.03."""
     geometry, m = sphere[0][::2], sphere[1][::2]

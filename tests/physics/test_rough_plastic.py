@@ -89,7 +89,7 @@ def measured(points: ScatteringGeometry, rows: np.ndarray, seed: int, electrons:
     return values, sigma[:, None, None] ** 2 * np.eye(len(rows))
 
 
-@pytest.mark.parametrize("light", ["mueller", "stokes"])
+@pytest.mark.parametrize("light", [pytest.param("mueller", marks=pytest.mark.long), "stokes"])
 def test_constants_are_within_their_errors(light):
     rows = np.eye(16) if light == "mueller" else np.kron(np.eye(4)[:3], VERTICAL)
     z = []

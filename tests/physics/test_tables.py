@@ -33,8 +33,7 @@ def reference(axes: TableAxes, angles: Angles, values: np.ndarray) -> dict[tuple
     return {k: np.array(v) for k, v in bins.items()}
 
 
-@pytest.mark.parametrize("layout", ["degree", "renderer"])
-@pytest.mark.parametrize("quantities", [1, 2, 5, 16])
+@pytest.mark.parametrize(("layout", "quantities"), [("degree", 16), ("renderer", 2)])
 def test_mean_variance_and_count_equal_a_loop_over_pixels(layout, quantities):
     angles = random_angles(3000)
     values = np.random.default_rng(1).normal(3, 1, size=(quantities, 3000)).astype(np.float32)
