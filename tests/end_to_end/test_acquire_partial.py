@@ -28,10 +28,8 @@ INSTRUMENTS = {
     "rotating_retarder_stokes": ("{kind: table, angles: {psa: [0, 22.5, 45, 67.5, 90, 112.5, 135, 157.5]}}", 4),
     "rotating_analyzer": ("{kind: table, angles: {psa: [0, 30, 60, 90, 120, 150]}}", 3),
     "linear_mueller": (SIXTEEN + "psa: [0,60,120,100,0,60,120,100,0,60,120,100,0,60,120,100]}}", 9),
-    "drr_5to1": ("{kind: rotating_retarders, states: 30, step_deg: 6, ratio: 5}", 16),
     "drr_wollaston": (f"{{kind: table, angles: {{psg: {[6.0 * k for k in range(18)]}}}}}", 16),
     "dual_beam_charis": (TELESCOPE, 9),
-    "polarization_camera_retarder": ("{kind: table, angles: {psa: [0, 22.5, 45, 67.5]}}", 4),
     "mosaic_polarimeter": ("{kind: table, angles: {psg: [0, 24, 48, 72, 96, 120]}}", 12),
 }
 #: What the rig's rotators are called; the axes are the user's.

@@ -81,7 +81,19 @@ MIXED = [
     ("operator", {"apt-k10cr1": ("psg", "psa"), "esp301": ("arm",)}, {"kind": "manual", "wavelengths_nm": [662]}),
     ("three makers", {"apt-kdc101": ("psg",), "elliptec": ("psa",), "zaber": ("arm",)}, SHUTTER),
 ]
-RIGS = [pytest.param({kind: AXES}, SHUTTER, id=f"all {kind}") for kind in _kinds()]
+
+
+def _rigs_of_three() -> list[dict[str, tuple[str, ...]]]:
+    """Rigs in which each kind moves an axis: three kinds a rig, the last with some of the first."""
+    kinds = _kinds()
+    return [
+        {kind: (axis,) for kind, axis in zip((kinds + kinds)[first : first + 3], AXES, strict=True)}
+        for first in range(0, len(kinds), 3)
+    ]
+
+
+RIGS = [pytest.param(parts, SHUTTER, id=" ".join(parts)) for parts in _rigs_of_three()]
+RIGS += [pytest.param({kind: AXES}, SHUTTER, id=f"all {kind}") for kind in ("elliptec", "esp301", "smc100")]
 RIGS += [pytest.param(parts, source, id=name) for name, parts, source in MIXED]
 
 

@@ -80,8 +80,7 @@ def test_another_sample_is_no_check(air, process):
     assert (code, "sample unknown, but" in err, "--reference" in err) == (2, True, True), err
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_noise_alone_is_no_change(air, process, seed):
-    reference, today = air("reference", 0.0, 10 + seed), air("today", 0.0, 20 + seed)
+def test_noise_alone_is_no_change(air, process):
+    reference, today = air("reference", 0.0, 10), air("today", 0.0, 20)
     code, out, err = process("check", today, "--reference", reference, "--tolerance", 0)
     assert code == 0, out + err

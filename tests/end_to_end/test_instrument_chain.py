@@ -14,7 +14,13 @@ def test_every_instrument_has_its_line(configs):
     assert set(BENCHES) == {path.stem for path in (configs / "instruments").glob("*.yaml")}
 
 
-@pytest.mark.parametrize("name", BENCHES)
+#: An instrument of each kind: two plates, two beams, mosaic, Stokes, part of a matrix. The others are `long`.
+KINDS = {"rgb950", "drr_wollaston", "mosaic_polarimeter", "rotating_retarder_stokes", "linear_mueller"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] * (name not in KINDS)) for name in BENCHES]
+)
 def test_the_next_sample_is_measured_better_or_as_before(name, tmp_path):
     row = chain.emulated(name, tmp_path)
     assert row.written <= 1.01 * min(row.nominal, row.train)
@@ -55,6 +61,7 @@ def test_a_fault_of_the_air_capture_alone_stays_there(fault, tmp_path):
     assert row.written < 0.5 * row.nominal
 
 
+@pytest.mark.long
 def test_a_source_that_wanders_in_air_alone_stays_there(tmp_path):
     """One pixel, an unknown noise and structure: one draw says little, so three are averaged."""
     rows = []
@@ -66,8 +73,7 @@ def test_a_source_that_wanders_in_air_alone_stays_there(tmp_path):
     assert np.mean([row.written / row.nominal for row in rows]) < 0.6
 
 
-@pytest.mark.parametrize("is_nominal", [False, True])
-@pytest.mark.parametrize("gains", [(1.03, 1.0), (1.05, 1.02)])
+@pytest.mark.parametrize(("gains", "is_nominal"), [((1.03, 1.0), False), ((1.05, 1.02), True)])
 def test_the_noise_of_a_dark_channel_is_no_tone_curve(gains, is_nominal, configs, tmp_path):
     """A polarization camera sees horizontal light: one channel is dark, and the gains of two others are off."""
     names = ("45", "135")

@@ -6,6 +6,7 @@ import inspect
 import json
 import re
 import shutil
+from functools import cache
 from pathlib import Path
 
 import h5py
@@ -13,7 +14,9 @@ import pytest
 
 import acquisition
 import processing
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.instrument.model import InstrumentModel
+from processing.yaml_file import dump_yaml, parse_yaml
 from simulators.bench.bench import SimulatedBench
 from simulators.bench.scene import Scene
 from simulators.bench.virtual_capture import write_virtual_capture
@@ -61,6 +64,16 @@ def captures(tmp_path_factory, configs):
     return folder
 
 
+@cache
+def _diagnosis(paths, model_text):
+    return diagnose_captures(paths, parse_yaml(model_text, InstrumentModel))
+
+
+def diagnosed_once(paths, model):
+    """`diagnose_captures`: the captures are those of every folder, and several examples diagnose them."""
+    return _diagnosis(tuple(paths), dump_yaml(model))
+
+
 @pytest.mark.parametrize("package", [processing, acquisition], ids=lambda package: package.__name__)
 def test_every_public_name_has_an_example(package):
     names = [name for name in package.__all__ if not isinstance(getattr(package, name), Path)]
@@ -85,6 +98,7 @@ def test_every_public_function_describes_what_it_takes_and_returns():
 def test_examples_print_what_they_say(name, captures, tmp_path, monkeypatch):
     module = importlib.import_module(name)
     public = {public: getattr(processing, public) for public in processing.__all__}
+    public["diagnose_captures"] = diagnosed_once
     examples = doctest.DocTestFinder().find(module, extraglobs=public | {"Path": Path})
     output: list[str] = []
     runner = doctest.DocTestRunner(verbose=False)
