@@ -1,5 +1,7 @@
 """Every kind of axis passes the conformance kit. A new kind is under test by being in the two folders."""
 
+from typing import Any
+
 import pytest
 
 from drivers.motion import AxisConfig
@@ -13,21 +15,28 @@ from simulators.serial.serve_options import ServeOptions
 # The allowance of a single test, and for each round of noise.
 pytestmark = pytest.mark.timeout(600 + 10 * ROUNDS)
 
+#: The others of Thorlabs' are the same program with other numbers; `tests/end_to_end/test_acquire_rigs.py` moves them.
+ALIKE = {"apt-bsc203", "apt-k10cr2", "apt-kbd101", "apt-kst101"}
+
+
+def _marked(kinds: list[str]) -> list[Any]:
+    return [pytest.param(kind, marks=[pytest.mark.long] * (kind in ALIKE)) for kind in kinds]
+
 
 class TestEveryAxis(AxisConformance):
-    @pytest.fixture(params=motion_kinds())
+    @pytest.fixture(params=_marked(motion_kinds()))
     def kind(self, request: pytest.FixtureRequest) -> str:
         return str(request.param)
 
 
 class TestSharedLines(SharedLineConformance):
-    @pytest.fixture(params=motion_kinds(axes=2))
+    @pytest.fixture(params=_marked(motion_kinds(axes=2)))
     def kind(self, request: pytest.FixtureRequest) -> str:
         return str(request.param)
 
 
 class TestSerialPorts(SerialPortConformance):
-    @pytest.fixture(params=serial_kinds())
+    @pytest.fixture(params=_marked(serial_kinds()))
     def kind(self, request: pytest.FixtureRequest) -> str:
         return str(request.param)
 
