@@ -35,12 +35,12 @@ def with_values(path: Path, values: dict[str, object], to: Path) -> Path:
 
 
 def write_rig(configs: Path, path: Path, top: dict | None = None, **simulator: object) -> Path:
-    """Write the simulated rig with small frames and a fast clock; keywords change its `simulator` section."""
+    """Write the simulated rig: small frames, a fast clock, no settling; keywords change its `simulator` section."""
     rigs, asked = configs / "rigs", repr((configs, top, simulator))
 
     def change(rig: Any) -> None:
         rig["simulator"].update({"rows": 64, "columns": 80, "clock_speed": 50, "camera_wait_s": 60} | simulator)
-        rig.update(top or {})
+        rig.update({"settle_s": 0.0} | (top or {}))
         for mode in rig["modes"].values():
             mode["instrument"] = str((rigs / mode["instrument"]).resolve())
         samples = rig["simulator"]["samples"]

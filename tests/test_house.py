@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tomllib
 from fnmatch import fnmatch
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -14,6 +15,12 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("drivers", "processing", "simulators", "acquisition", "viewer")
+
+
+@cache
+def parsed(file: Path) -> ast.Module:
+    """A module's tree: several tests walk all of them."""
+    return ast.parse(file.read_text(encoding="utf-8"))
 
 
 def imports(root: Path) -> dict[str, set[str]]:
@@ -26,7 +33,7 @@ def imports(root: Path) -> dict[str, set[str]]:
     edges = {}
     for module, file in files.items():
         targets = set()
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for node in ast.walk(parsed(file)):
             if isinstance(node, ast.ImportFrom) and node.module:
                 names = (f"{node.module}.{alias.name}" for alias in node.names)
                 targets |= {name if name in files else node.module for name in names}
@@ -44,7 +51,7 @@ def test_one_class_name_is_one_class():
     places: dict[str, list[str]] = {}
     for package in PACKAGES:
         for file in (ROOT / package).rglob("*.py"):
-            for node in ast.parse(file.read_text(encoding="utf-8")).body:
+            for node in parsed(file).body:
                 if isinstance(node, ast.ClassDef) and node.name not in OF_EACH_KIND:
                     places.setdefault(node.name, []).append(str(file.relative_to(ROOT)))
     assert {name: files for name, files in places.items() if len(files) > 1} == {}

@@ -31,7 +31,7 @@ SHORT = MeasurementPlan(omega_deg=35.0, darks=1, states={"kind": "rotating_retar
 
 @pytest.fixture
 def bench(small_rig):
-    with open_bench(small_rig(top={"settle_s": 0.0}, rows=24, columns=32), home=True) as bench:
+    with open_bench(small_rig(rows=24, columns=32), home=True) as bench:
         yield bench
 
 

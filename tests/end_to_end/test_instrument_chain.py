@@ -55,7 +55,7 @@ def test_a_plate_of_fewer_states_of_air_is_nearer_too(public_files, tmp_path):
     assert row.written <= row.train < 0.0015
 
 
-@pytest.mark.parametrize("fault", ["slips", "angles"])
+@pytest.mark.parametrize("fault", ["slips", pytest.param("angles", marks=pytest.mark.long)])
 def test_a_fault_of_the_air_capture_alone_stays_there(fault, tmp_path):
     row = chain.emulated("rgb950", tmp_path, 2, OF_AIR[fault])
     assert row.written < 0.5 * row.nominal

@@ -26,7 +26,7 @@ def core(monkeypatch):
 
 @pytest.fixture
 def rig(core, small_rig):
-    with rig_in_core(core, small_rig(top={"settle_s": 0.0}, rows=24, columns=32), home=True) as rig:
+    with rig_in_core(core, small_rig(rows=24, columns=32), home=True) as rig:
         yield rig
 
 

@@ -42,9 +42,17 @@ def capture(synthetic_capture, configs, tmp_path) -> Path:
     return path.rename(path.parent / "captures" / "drr_omega35.h5")
 
 
+#: The product of that capture, made once.
+MADE: dict[str, bytes] = {}
+
+
 @pytest.fixture
 def product(capture) -> Path:
-    return Reduction(capture).make(capture.with_suffix(".mueller.h5"))
+    path = capture.with_suffix(".mueller.h5")
+    if not MADE:
+        MADE["mueller"] = Reduction(capture).make(path).read_bytes()
+    path.write_bytes(MADE["mueller"])
+    return path
 
 
 @pytest.fixture

@@ -108,10 +108,10 @@ def content() -> Callable[[Path], dict[str, object]]:
 
 @pytest.fixture
 def quick_rig(small_rig: Callable[..., Path]) -> Callable[..., Path]:
-    """A rig for fault runs: small frames, no settling; stamped with the true angles."""
+    """A rig for fault runs, its frames stamped with the true angles."""
 
     def make(name: str = "rig.yaml", top: dict | None = None, **simulator: object) -> Path:
-        return small_rig(name, top={"settle_s": 0.0} | (top or {}), **({"stamp": True} | simulator))
+        return small_rig(name, top=top, **({"stamp": True} | simulator))
 
     return make
 

@@ -74,9 +74,9 @@ def test_what_differs_is_refused_in_words_or_kept_apart(campaign, intact):
 
 
 def test_a_foreign_file_under_the_expected_name_is_refused(campaign, acquire, tmp_path):
-    run, rig, _, folder = campaign
+    run, rig, plan, folder = campaign
     path = _only(folder)
-    acquire.made("--omega", 40, "--rig", rig, "--out", tmp_path / "other")
+    acquire.made("--omega", 40, "--plan", plan, "--rig", rig, "--out", tmp_path / "other")
     shutil.copy(_only(tmp_path / "other"), path)
     code, _, err = run()
     assert code == 2

@@ -45,7 +45,7 @@ def _open_files(pid):
 def begun(small_rig, spawn, tmp_path, monkeypatch):
     """A long capture behind real ports; returns the rig outside of the program, the program and its captures."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    rig = small_rig("rig.yaml", top={"settle_s": 0.0}, clock_speed=1, camera_wait_s=60)
+    rig = small_rig("rig.yaml", clock_speed=1, camera_wait_s=60)
     with serve(rig, tmp_path / "served.yaml", "red_sphere") as simulation:
         out = tmp_path / "captures"
         child = spawn("--omega", 35, "--rig", tmp_path / "served.yaml", "--out", out)
@@ -132,6 +132,7 @@ def test_a_command_that_a_page_starts_has_its_output_written_by_another(tmp_path
     while jobs.running(job):
         with contextlib.suppress(FileNotFoundError):
             files.update(_open_files(job.pid))
+        time.sleep(0.005)
     _wait_for(lambda: jobs.code(job) == 0)
     assert "psg at 90" in jobs.output(job)
     assert files
@@ -141,7 +142,7 @@ def test_a_command_that_a_page_starts_has_its_output_written_by_another(tmp_path
 @pytest.mark.timeout(120)
 def test_a_wire_log_on_a_disc_that_hangs_holds_up_no_light(small_rig, tmp_path):
     """The process that writes the log is stopped: its pipe takes 64 KiB, and a write waits for ever then."""
-    small_rig("rig.yaml", top={"settle_s": 0.0})
+    small_rig("rig.yaml")
     with serve(tmp_path / "rig.yaml", tmp_path / "served.yaml", "red_sphere") as simulation:
         config = load_rig(tmp_path / "served.yaml").model_copy(update={"wire_log": tmp_path / "wire"})
         with open_rig(config, with_camera=False) as rig:

@@ -36,7 +36,7 @@ def served(quick_rig, tmp_path, monkeypatch):
         "arm": {"kind": "smc100", "port": "sim:arm", "address": 1, "limits_deg": [0, 180]} | patient,
     }
     source = {"kind": "sc10", "port": "sim:shutter", "blade_s": 60} | patient
-    top = {"settle_s": 0.0, "alert": [str(hook)], "alert_every_s": 1, "axes": axes, "source": source}
+    top = {"alert": [str(hook)], "alert_every_s": 1, "axes": axes, "source": source}
     rig = quick_rig("behind.yaml", clock_speed=4, top=top)
     with serve(rig, tmp_path / "served.yaml", "red_sphere") as simulation:
         yield simulation, tmp_path / "served.yaml", alarms

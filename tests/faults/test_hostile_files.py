@@ -27,14 +27,23 @@ from tests.rig_files import change_yaml
 SHORT = {"states": {"kind": "table", "angles": {"psg": [0.0, 10.0, 20.0]}}, "darks": 1, "mode": "stokes"}
 
 
+#: The partial capture that many tests spoil, taken once.
+TAKEN = {}
+
+
 @pytest.fixture
-def partial(run_with):
+def partial(run_with, quick_rig, tmp_path):
     def act(rig, state, retake):
         if state == 2:
             raise AcquisitionError("enough")
 
-    _, path = run_with(act, plan=SHORT)
-    return path
+    if not TAKEN:
+        TAKEN["bytes"] = run_with(act, plan=SHORT)[1].read_bytes()
+    quick_rig()
+    copy = tmp_path / "copy" / "run.h5.partial"
+    copy.parent.mkdir()
+    copy.write_bytes(TAKEN["bytes"])
+    return copy
 
 
 @pytest.fixture

@@ -54,7 +54,7 @@ def night(acquire, small_rig, tmp_path):
             f"kind: campaign\nname: night\nplans: {{stokes: {plan}}}\nsamples: [{{name: red_sphere}}]\n"
             f"wavelengths_nm: [662]\nomega_deg: [35]\nretries: {retries}\nretry_wait_s: 0\n"
         )
-        rig = small_rig("rig.yaml", top={"settle_s": 0.0, "notify": {"command": [str(hook)]}})
+        rig = small_rig("rig.yaml", top={"notify": {"command": [str(hook)]}})
         code, out, err = acquire("--campaign", tmp_path / "night.yaml", "--rig", rig, "--out", tmp_path)
         folder = tmp_path / "night"
         (entry,) = json.loads((folder / "index.json").read_text()).values()

@@ -247,8 +247,9 @@ def test_captures_leave_no_thread_and_no_descriptor(run_with):
     def held():
         return len(list(Path("/proc/self/fd").iterdir())), sorted(thread.name for thread in threading.enumerate())
 
-    run_with()
+    few = {"mode": "stokes", "states": {"kind": "fixed", "states": 2}}
+    run_with(plan=few)
     before = held()
     for _ in range(2):
-        run_with()
+        run_with(plan=few)
     assert held() == before

@@ -51,7 +51,7 @@ def wollaston(public_files, folder: Path, instrument: Path, wavelength_nm: int) 
 @pytest.mark.parametrize(
     ("wavelength_nm", "least", "most", "sure"),
     [
-        (1200, 0.2, 0.27, {"psg_extinction"}),
+        pytest.param(1200, 0.2, 0.27, {"psg_extinction"}, marks=pytest.mark.long),
         # A value for each intensity would leave 0.001 %, which says nothing.
         (1300, 0.1, 0.25, set()),
         pytest.param(1950, 0.2, 0.45, {"generator_ellipticity"}, marks=pytest.mark.long),

@@ -99,6 +99,7 @@ def test_an_image_that_moves_twice_a_turn_is_corrected_without_a_name(configs, t
     assert [e.element for e in diagnosis.applied()] == ["shift right and shift down of image by 2 x psg"]
 
 
+@pytest.mark.long
 def test_a_focus_that_follows_a_plate_is_corrected_without_a_name(configs, tmp_path, bench):
     turn = 2 * np.pi / STATES
     bench.light.append(lambda k, e: gaussian_filter(e, np.sqrt(0.15 * (1 + np.cos(turn * k))), mode="nearest"))
@@ -135,7 +136,7 @@ def test_a_black_level_that_drifts_is_no_bent_response(configs, tmp_path, bench)
     ("sentence", "values"),
     [
         ("diattenuation and diattenuation at 45 degrees of exit by 4 x hwp", [0.0, 0.004, 0.006, 0.0]),
-        ("circular diattenuation of exit over time", [0.02]),
+        pytest.param("circular diattenuation of exit over time", [0.02], marks=pytest.mark.long),
     ],
 )
 def test_optics_before_a_prism_are_corrected_where_axes_turn_by_a_quarter(configs, tmp_path, sentence, values):

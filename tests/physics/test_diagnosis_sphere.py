@@ -54,7 +54,11 @@ def test_a_true_model_is_left_in_peace(scene, declared, tmp_path):
 
 @pytest.mark.parametrize(
     ("instrument", "kind"),
-    [("rgb950", "registration"), ("rgb950", "illumination_azimuth"), ("linear_stokes", "analyzer_roll")],
+    [
+        ("rgb950", "registration"),
+        pytest.param("rgb950", "illumination_azimuth", marks=pytest.mark.long),
+        ("linear_stokes", "analyzer_roll"),
+    ],
 )
 def test_what_is_wrong_gets_its_name(scene, configs, tmp_path, instrument, kind):
     declared = InstrumentModel.load(configs / f"instruments/{instrument}.yaml")

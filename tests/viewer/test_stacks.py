@@ -34,7 +34,7 @@ def night(drr_capture, client):
     assert client.post("/keep-region", json={"file": "red_35.h5", "name": "spot"} | PLACE, headers=HERE).is_success
 
 
-def test_a_point_is_the_mean_that_the_command_gives(night, client, lab):
+def test_a_point_is_the_mean_that_the_command_gives(night, client, drr_capture, lab):
     query = {"kind": "mueller", "name": "mueller", "index": 5, "region": "spot", "label": "m11 over m00"}
     stack = client.get("/stacked", params=query).json()
     assert stack["left_out"] == {}
@@ -60,11 +60,8 @@ def test_a_point_is_the_mean_that_the_command_gives(night, client, lab):
         point = points[lab / file]
         assert (point["value"], point["error"], point["omega"]) == (pytest.approx(value), pytest.approx(u), omega)
     assert np.isfinite(stack.time.values.astype(float)).all()
-
-
-def test_images_of_another_form_and_other_quantities_are_left_out_with_the_reason(night, client, drr_capture):
+    # Images of another form are left out with the reason.
     Reduction(drr_capture("wide.h5", shape=(12, 20), omega_deg=20.0)).make()
-    query = {"kind": "mueller", "name": "mueller", "index": 5, "region": "spot"}
     stack = client.get("/stacked", params=query).json()
     assert (len(stack["points"]), list(stack["left_out"].values())) == (6, [1])
     # The middle half is there in every image.
