@@ -14,7 +14,7 @@ from processing.diagnosis.search.decision import predicted_change
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import FEW_CAUSES, TAU, TAU_WEIGHT
+from processing.diagnosis.search.rules import TAU, TAU_WEIGHT
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State
 from processing.diagnosis.search.space import Space
 from processing.effect import Effect, Parameter
@@ -137,7 +137,7 @@ def test_what_is_unlikely_one_by_one_is_likely_together():
     factor = np.sqrt(width) / TAU * np.exp(0.5 * gradient[:, None] ** 2 * width)
     factor *= TAU_WEIGHT
     count = np.arange(size + 1)
-    prior = np.exp(betaln(1 + count, size - count + FEW_CAUSES * size))
+    prior = np.exp(betaln(1 + count, size - count + 1))
     total = prior @ symmetric(factor.sum(axis=1))
     exact = np.array(
         [f * (prior[1:] @ symmetric(np.delete(factor.sum(axis=1), k))) for k, f in enumerate(factor.sum(axis=1))]

@@ -18,9 +18,6 @@ TAU_WEIGHT = np.array([0.1, 0.0, 0.2, 0.0, 0.3, 0.0, 0.3, 0.0, 0.1])
 TAU_WEIGHT_OF_MANY = np.array([0.04, 0.08, 0.1, 0.13, 0.16, 0.16, 0.16, 0.1, 0.07])
 #: [1] Values from which on a group has many: it can do what several others do.
 MANY = 9
-#: [1] Weight of the prior for few causes: with k of n groups there, one more has odds of (1 + k) to ((1 + this) n - k -
-#: 1). A clean bench has few causes, one with six faults may well have a seventh.
-FEW_CAUSES = 0.5
 #: [typical sizes] Standard deviation of a nominal value of the train (30 degrees): the weakest prior that keeps it.
 NOMINAL_TAU = 10.0
 #: [degree] Typical size of a nominal azimuth or retardance: what is read off a mount or a label is no better.

@@ -20,7 +20,7 @@ from scipy.linalg.lapack import dlauum, dtrtri
 from scipy.special import betaln
 
 from processing.arrays import Array
-from processing.diagnosis.search.rules import FEW_CAUSES, MANY, TAU, TAU_WEIGHT, TAU_WEIGHT_OF_MANY
+from processing.diagnosis.search.rules import MANY, TAU, TAU_WEIGHT, TAU_WEIGHT_OF_MANY
 
 #: [log odds] Of an impossible set, below the evidence of any data.
 NEVER = -1e9
@@ -180,16 +180,19 @@ class Sets:
         return self.log_prior(is_included) + float(np.log(np.maximum(weight, 1e-300)).sum())
 
     def log_prior(self, is_included: NDArray[np.bool_]) -> float:
-        """Log probability of a set: how likely a group is is learnt from how many there are (beta-binomial)."""
+        """Log probability of a set: any rate of causes is as likely as another (Scott and Berger, Ann. Stat. 38, 2010).
+
+        So the rate is learnt from how many groups there are.
+        """
         k, n = float(is_included.sum()), self.count
-        count = betaln(1 + k, max(n - k, 0.0) + FEW_CAUSES * n) - betaln(1, (1 + FEW_CAUSES) * n)
+        count = betaln(1 + k, max(n - k, 0.0) + 1) - betaln(1, n + 1)
         too_many = max(float((is_included & self.alone).sum()) - 1, 0.0)
         return float(count - np.log(self.share[is_included]).sum() - self.price[is_included].sum()) + NEVER * too_many
 
     def prior_odds(self, is_included: NDArray[np.bool_]) -> Array:
         """Log odds (G,) of each group to be there, of the prior, given the others of a set."""
         other_count = is_included.sum() - is_included
-        absent_count = np.maximum((1 + FEW_CAUSES) * self.count - other_count - 1, FEWEST_ABSENT)
+        absent_count = np.maximum(self.count - other_count, FEWEST_ABSENT)
         beside = np.where(self.alone, (is_included & self.alone).sum() - (is_included & self.alone), 0.0)
         return np.asarray(np.log((1 + other_count) / absent_count / self.share) - self.price) + NEVER * beside
 
