@@ -34,6 +34,8 @@ from processing.storage.captures.capture import Capture, CaptureError
 AS_LIKELY = 0.015
 #: [1] Times that an error may grow at most as a bent valley asks.
 MOST_WIDER = 8.0
+#: [1] How close to its end such a search comes.
+CLOSE = 1.05
 CONFIRM = (
     " Confirm with a full Mueller capture: linear Stokes cannot test that the three other processes are equal, and so "
     "small a residual may come from that alone."
@@ -106,20 +108,25 @@ def widen_errors(problem: SurfaceProblem, posterior: Posterior, solved: Solution
     Also by how much wider each value (K,) of the posterior is.
 
     Slopes at one point promise less than a bent valley holds. Along each principal axis an error is a third of the way
-    to where chi-square and prior, the mean of both sides, have risen by nine.
+    to where chi-square and prior have risen by nine, on the side where they rise less.
     """
     space, values, part = solved.space, solved.fit.values, dict(posterior.space.pairs)
     index = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[part[c]] for c in space.candidates)])
     typical, lower, upper = (space.joined(name) for name in ("typical", "lower", "upper"))
     size, axes = np.linalg.eigh(posterior.covariance[np.ix_(index, index)] / np.outer(typical, typical))
     wide = np.ones(size.size)
+
+    def rise(step: Array) -> float:
+        ends = [end for end in (values + step, values - step) if np.all((lower <= end) & (end <= upper))]
+        excess = [problem.sums(space, end, derivatives=False).excess.sum() for end in ends]
+        # What the data do not tell is as wide as its prior.
+        least = min(excess, default=np.inf) - solved.fit.excess + solved.weak @ step**2
+        return max(float(least), 1e-300) / posterior.samples.best.unit
+
     for j in np.flatnonzero(size > 0):
         step = SHOWN * np.sqrt(size[j]) * axes[:, j] * typical
-        ends = [np.clip(values + sign * step, lower, upper) for sign in (1, -1)]
-        rise = np.mean([problem.sums(space, end, derivatives=False).excess.sum() for end in ends]) - solved.fit.excess
-        # What the data do not tell is as wide as its prior.
-        rise = max(rise + solved.weak @ step**2, 1e-300) / posterior.samples.best.unit
-        wide[j] = np.clip(SHOWN / np.sqrt(rise), 1.0, MOST_WIDER)
+        while wide[j] < MOST_WIDER and (missing := SHOWN / np.sqrt(rise(wide[j] * step))) > CLOSE:
+            wide[j] = min(wide[j] * min(missing, 2.0), MOST_WIDER)
     covariance = posterior.covariance.copy()
     covariance[np.ix_(index, index)] = (axes * size * wide**2) @ axes.T * np.outer(typical, typical)
     wider = np.sqrt(np.diag(covariance) / np.maximum(np.diag(posterior.covariance), 1e-300))
