@@ -98,7 +98,7 @@ def test_long_tests_are_left_out_with_a_line(two_tests, options):
     assert "1 long tests left out; run them too: ./lab test --all" in output
 
 
-@pytest.mark.parametrize("options", [("--all", "-n", "1"), ("tests/test_two.py",), ("-m", "not other")])
+@pytest.mark.parametrize("options", [("--all",), ("-m", "not other")])
 def test_what_is_selected_runs_although_it_is_long(two_tests, options):
     output = two_tests(*options)
     assert "2 passed" in output

@@ -87,14 +87,14 @@ class AxisFaults(AxisTests):
         """One spoiled reply, at every place of the exchange: the move ends right, or with an error."""
         right = 0
         with self.served(kind) as served:
-            axis = served.open()
+            axis = served.open(reply_s=0.15)
             for place in range(1, 13) if fault == "garbled" else (1, 4, 7, 10):
-                served.emulator.faults.add(Fault(fault, from_command=place, commands=1, amount=0.13))  # type: ignore[arg-type]
+                served.emulator.faults.add(Fault(fault, from_command=place, commands=1, amount=0.07))  # type: ignore[arg-type]
                 target_deg = 7.0 * place
                 try:
                     position = axis.start_move(target_deg).wait()
                 except DeviceError:
-                    patient_clock().sleep_s(0.15)
+                    patient_clock().sleep_s(0.1)
                     if not axis.is_homed():
                         break
                     continue

@@ -27,7 +27,7 @@ from simulators.serial.tcp_port import port_for
 
 #: Longer than all tries of an exchange on a busy machine: what takes longer hangs.
 HANGS_S = 60.0
-ROUNDS = int(os.environ.get("UMOV_FUZZ_ROUNDS", "10"))
+ROUNDS = int(os.environ.get("UMOV_FUZZ_ROUNDS", "6"))
 
 
 class NoisyWire:

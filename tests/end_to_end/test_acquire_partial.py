@@ -26,7 +26,6 @@ TELESCOPE = "{{kind: table, angles: {{hwp: {}, image_rotator: {}}}}}".format(
 #: States that determine all that the instrument can, and how many numbers that is.
 INSTRUMENTS = {
     "rotating_retarder_stokes": ("{kind: table, angles: {psa: [0, 22.5, 45, 67.5, 90, 112.5, 135, 157.5]}}", 4),
-    "rotating_analyzer": ("{kind: table, angles: {psa: [0, 30, 60, 90, 120, 150]}}", 3),
     "linear_mueller": (SIXTEEN + "psa: [0,60,120,100,0,60,120,100,0,60,120,100,0,60,120,100]}}", 9),
     "drr_wollaston": (f"{{kind: table, angles: {{psg: {[6.0 * k for k in range(18)]}}}}}", 16),
     "dual_beam_charis": (TELESCOPE, 9),

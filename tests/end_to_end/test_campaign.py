@@ -217,6 +217,7 @@ def test_noise_of_psi_and_magnitude_explains_no_more_than_there_is(serial):
 
 
 @SLOW_DISC
+@pytest.mark.long
 def test_a_cluster_gives_the_same_numbers(folder, serial, configs, tmp_path):
     distributed = pytest.importorskip("distributed")
     files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"

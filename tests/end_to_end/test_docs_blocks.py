@@ -72,10 +72,11 @@ SMALLER = {
     "configs/campaigns/red_sphere.yaml": {"stop: 90": "stop: 20", "[451, 662]": "[662]"},
 }
 UNTIL_CTRL_C = "until Ctrl-C"
-#: Pages whose commands take more than about three seconds of a processor; the README's run always.
+#: Pages whose commands take more than about three seconds of a processor; the README's run always, and are also those
+#: of the first tutorial.
 LONG = {
     *("acquisition", "calibration", "closing-the-loop", "other-tools", "processing", "quantities", "view"),
-    "tutorial-close-the-loop",
+    *("tutorial-close-the-loop", "tutorial-first-capture", "adding-a-driver"),
 }
 SLOW = "UMOV_SLOW"
 

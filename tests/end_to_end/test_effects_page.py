@@ -15,7 +15,13 @@ def test_the_page_is_that_of_the_effects():
     assert effects_page.PAGE.read_text(encoding="utf-8") == effects_page.page()
 
 
-@pytest.mark.parametrize("kind", effects_page.pictured_kinds())
+#: Every fifth picture, the others at night: the page and the faults are compared for all.
+PICTURED = [
+    pytest.param(kind, marks=[pytest.mark.long] * (n % 5 > 0)) for n, kind in enumerate(effects_page.pictured_kinds())
+]
+
+
+@pytest.mark.parametrize("kind", PICTURED)
 def test_a_picture_shows_the_residual_of_its_fault(kind):
     shown = cv2.imread(str(effects_page.PICTURES / f"{kind}.png")).astype(int)
     out = BytesIO()

@@ -70,6 +70,7 @@ def _get(url, path, host=None, method="GET", origin=None, data=None):
         return answer.status, answer.read()
 
 
+@pytest.mark.long
 def test_page_shows_the_capture_and_its_button_stops_it(running, browser):
     child, url, folder = running
     page = browser.new_page(viewport={"width": 390, "height": 844}, device_scale_factor=2, is_mobile=True)

@@ -360,6 +360,7 @@ def test_the_colour_bar_of_a_mueller_image_has_an_arrow_where_values_lie_beyond_
     assert [bar.extend for bar in bars] == [arrow]
 
 
+@pytest.mark.long
 def test_a_mueller_image_alone_is_exported_as_its_own_figure(exported, tmp_path):
     (alone,) = exported("product", "--to", "png", "--plane", "mueller", "--out", f"{tmp_path}/alone.png")
     assert alone.name == "alone.png"

@@ -78,6 +78,7 @@ def test_intervals_hold_what_the_instrument_file_leaves_uncertain(bench, configs
     assert full.pixels > noise.pixels
 
 
+@pytest.mark.long
 def test_same_seed_gives_the_same_bench(bench, tmp_path, configs):
     folder, truth = bench
     assert make_bench(tmp_path, SEED, configs, pixels=SMALL) == truth

@@ -59,7 +59,7 @@ def _until(condition, child=None):
 
 @pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGSTOP])
 def test_killed_or_frozen_the_light_is_shut_and_the_axes_stop(
-    kind, spawn, partial_of, plan_file, served, intact, tmp_path
+    kind, spawn, acquire, partial_of, plan_file, served, intact, tmp_path
 ):
     simulation, rig, alarms = served
     child = spawn("--omega", 35, "--plan", plan_file, "--rig", rig, "--out", tmp_path / "out")
@@ -76,9 +76,7 @@ def test_killed_or_frozen_the_light_is_shut_and_the_axes_stop(
     assert child.wait() == -signal.SIGKILL
     # What was done is there, and the rig is free again.
     assert intact(partial) >= 5
-    child = spawn("--resume", partial)
-    _, err = child.communicate()
-    assert child.returncode == 0, err
+    acquire.made("--resume", partial)
     assert "guard rests" in journal.read_text()
 
 

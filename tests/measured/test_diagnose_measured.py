@@ -173,6 +173,7 @@ def test_one_detector_behind_two_plates(public_files, configs, tmp_path, wavelen
     assert 0.3 < d.error_after.rms_percent < after
 
 
+@pytest.mark.long
 def test_wollaston_the_source_is_the_cause(public_files, configs, tmp_path):
     instrument = configs / "instruments/drr_wollaston.yaml"
     path, total = wollaston(public_files, tmp_path, instrument, 1600)

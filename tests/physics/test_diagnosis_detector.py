@@ -136,6 +136,7 @@ def test_an_offset_that_nothing_else_shows_leaves_the_noise_of_the_light(configs
 GAINS = {"45": 0.93, "90": 1.22, "135": 0.84}
 
 
+@pytest.mark.long
 def test_four_channels_of_unequal_gain_behind_a_flickering_source(configs, tmp_path):
     """40 exposures of air in four channels: what is left is the noise of 0.1 %, and the file holds the gains."""
     random = np.random.default_rng(3)

@@ -50,6 +50,7 @@ def judged(tmp_path, configs):
     return diagnosed
 
 
+@pytest.mark.long
 def test_one_pixel_without_noise_that_scatters_widely(judged):
     d = judged(0.3, None)
     assert d.verdict in ("undetermined", "unexplained")

@@ -53,6 +53,7 @@ def test_places_apart_are_no_fault(diagnosed):
     assert diagnosed(1.0, 1.0).verdict == "consistent"
 
 
+@pytest.mark.long
 def test_a_fault_beside_them_is_found(diagnosed):
     diagnosis = diagnosed(1.01)
     assert diagnosis.verdict == "explained"

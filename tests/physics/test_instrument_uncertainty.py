@@ -225,6 +225,7 @@ def test_a_mueller_table_covers_an_instrument_that_is_off_and_its_noise(stated, 
     assert np.sqrt(np.mean(np.square(pulls), axis=(0, 2))) == pytest.approx(np.ones(16), abs=0.1)
 
 
+@pytest.mark.long
 def test_what_two_instruments_do_to_a_table_adds_as_squares(stated, synthetic_capture, tmp_path, configs):
     """Their inputs have the same names. One instrument moves all images of a table alike."""
     model = InstrumentModel.load(stated).at(662)

@@ -94,6 +94,7 @@ def test_the_error_bars_have_the_levels_in_them(sample, pixels, measured):
     assert np.sqrt(np.mean(np.square(pulls))) == pytest.approx(1, abs=0.25)
 
 
+@pytest.mark.long
 def test_a_steady_source_costs_little(measured):
     """Light that hardly polarizes does not tell the levels: a source that is steady elsewhere is steady there."""
     ratio = []

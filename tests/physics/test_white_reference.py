@@ -87,7 +87,7 @@ def white(bench):
     return bench.product("white", bench.plaque(), REFLECTANCE / np.pi, 0.004)
 
 
-@pytest.mark.parametrize("ending", ["yaml", "csv"])
+@pytest.mark.parametrize("ending", ["yaml", pytest.param("csv", marks=pytest.mark.long)])
 def test_counts_of_other_exposures_become_a_brdf_with_the_error_of_the_certificate(bench, white, ending, tmp_path):
     sample = bench.product("sphere", bench.sphere, BRDF, 0.02)
     table = bench.table(sample, white, bench.plaque(), bench.certificate(ending=ending))

@@ -98,6 +98,7 @@ def test_no_page_has_a_finding_and_none_is_wider_than_its_window(pages, address,
     assert wrong == {}, wrong
 
 
+@pytest.mark.long
 def test_a_log_scrolls_by_keys(campaign, address, browser):
     page = browser.new_page(viewport={"width": 1400, "height": 500})
     page.goto(f"{address}{campaign}")
