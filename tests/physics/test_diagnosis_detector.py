@@ -165,7 +165,7 @@ def test_four_channels_of_unequal_gain_behind_a_flickering_source(configs, tmp_p
         assert written.value_of(f"{name}.gain") == pytest.approx(gain, abs=0.002)
 
 
-@pytest.mark.parametrize("frames", [1, 8])
+@pytest.mark.parametrize("frames", [1, pytest.param(8, marks=pytest.mark.long)])
 def test_a_list_of_states_without_a_column_of_an_axis(frames, configs, tmp_path):
     random = np.random.default_rng(0)
     scene = 200 + 100 * np.sin(np.arange(64) / 9)[:, None] * np.cos(np.arange(64) / 7)

@@ -40,7 +40,7 @@ def test_sound_frames_and_a_drifting_lamp_are_no_evidence(rows, seed):
     assert judge(rows, blocks * np.linspace(1, 1.08, STATES)[:, None, None]) == []
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", [0, 5, 11])
 @pytest.mark.parametrize("factor", [2.0, 1.1, 0.9])
 def test_one_state_of_another_exposure_is_named(rows, seed, factor):
     blocks, state = pictures(rows, seed), 3 + 3 * seed
@@ -50,7 +50,7 @@ def test_one_state_of_another_exposure_is_named(rows, seed, factor):
     assert f"state {4 + state} alone" in evidence.text
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", [0, 5, 11])
 @pytest.mark.parametrize("factor", [1.1, 1.05, 0.8])
 def test_a_gain_that_changes_on_the_way_is_named(rows, seed, factor):
     blocks, state = pictures(rows, seed), 4 + 3 * seed
@@ -61,7 +61,7 @@ def test_a_gain_that_changes_on_the_way_is_named(rows, seed, factor):
     assert float(re.search(r"is (\S+) times", evidence[0].text)[1]) == pytest.approx(factor, rel=0.02)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [0, 4])
 @pytest.mark.parametrize("flip", [np.s_[:, ::-1], np.s_[::-1, :], np.s_[::-1, ::-1]], ids=["lr", "ud", "180"])
 @pytest.mark.parametrize("onwards", [False, True])
 def test_a_mirrored_picture_is_named(rows, seed, flip, onwards):

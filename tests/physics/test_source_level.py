@@ -85,7 +85,7 @@ def test_the_product_holds_the_levels(measured, tmp_path):
     assert np.sqrt(np.mean(pulls**2)) == pytest.approx(1, abs=0.35)
 
 
-@pytest.mark.parametrize(("sample", "pixels"), [(HALF_WAVE, 1), (DEPOLARIZER, 40)])
+@pytest.mark.parametrize(("sample", "pixels"), [(HALF_WAVE, 1), pytest.param(DEPOLARIZER, 40, marks=pytest.mark.long)])
 def test_the_error_bars_have_the_levels_in_them(sample, pixels, measured):
     pulls = []
     for seed in range(12):
