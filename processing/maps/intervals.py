@@ -77,18 +77,25 @@ def set_magnitudes(
         else:
             vector, scale = quantity.parts.value, np.ones(())
             noise = (noises or {}).get(name) or of_slopes(covariance, vector, quantity.parts.gradient)
-        wide, far, of_68 = scale, scale, np.ones(())
+        wide, far = scale, np.ones(())
         if name.startswith("dominant_"):
             # Of the 68 and of the 95 % interval.
             by = [_turned(turn, deviate) for deviate in (1.0, NORMAL_95)]
-            wide, far, of_68 = scale * by[0], scale * by[1], np.sqrt(by[0] / by[1])
+            wide, far = scale * by[0], by[1] / by[0]
         length = np.asarray(quantity.value, dtype=float)
-        moments = (wide * noise.along, wide * noise.total, wide**2 * noise.square)
-        put(planes, name, *interval(length, *moments, below=far * noise.below, above=far * noise.above))
+        total, square = wide * noise.total, wide**2 * noise.square
+        along = wide * noise.along
+        plane = (wide**2 * noise.mixed, wide * noise.across, wide**2 * noise.further)
+        if name.startswith("dominant_"):
+            # A process is bent as well: what noise across adds to other lengths may be missing. Its mean square:
+            along = along + np.minimum((total**2 / 2 + square) / (2 * length**2), square / total)
+            plane = (0.0, 0.0, 0.0)
+        moments = (along, total, square)
+        put(planes, name, *interval(length, *moments, plane=plane, far=far))
         for angle in ANGLES_OF.get(name, ()):
             if angle in planes:
                 direction = length * vector / np.hypot(*vector)
-                _set_angle(planes, angle, direction, far * noise.packed[[0, 1, 3]], of_68=of_68)
+                _set_angle(planes, angle, direction, wide * far * noise.packed[[0, 1, 3]], of_68=np.sqrt(1 / far))
 
 
 def _turned(turn: Array | float, deviate: float) -> Array:

@@ -3,7 +3,8 @@
 Noise pushes lengths up, and an error bar that exists only where a length stands out is chosen by its outcome. Here the
 interval is that of Feldman and Cousins (Phys. Rev. D 57, 3873, 1998) for the distribution of the observed length: it
 covers as often as it claims at every true length, zero included, and passes from an upper limit to two sides by itself.
-The table is made by `benchmarks/magnitude_table.py`.
+The table is made by `benchmarks/magnitude_table.py`. It knows the noise along the vector and how many directions noise
+has. From 1.5 times the noise on, bounds are those of a modified signed root, which follows noise in all directions.
 
 Units: u^2 = tr C^2 / tr C, C being the covariance of the vector. In them the noise has `components` = (tr C)^2 / tr C^2
 components, and at most sqrt(components) is the variance along the vector; for n components alike these are n and 1.
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.computing.threads import for_ranges
-from processing.polarization.vector_kernels import DEVIATES, LEAST, lengths
+from processing.polarization.length_kernels import DEVIATES, LEAST, lengths
 
 LEVELS = (0.68268949, 0.95)
 #: Half the 95 % interval of a normal distribution, in standard deviations.
@@ -47,7 +48,13 @@ class Interval(NamedTuple):
 
 
 def interval(
-    length: Array, along: Array, total: Array, square: Array, *, below: Array | None = None, above: Array | None = None
+    length: Array,
+    along: Array,
+    total: Array,
+    square: Array,
+    *,
+    plane: tuple[Array | float, Array | float, Array | float] = (0.0, 0.0, 0.0),
+    far: Array | float = 1.0,
 ) -> Interval:
     """Interval of the true length of vectors.
 
@@ -56,8 +63,8 @@ def interval(
     length : (...), observed.
     along : (...), variance along the vector.
     total, square : (...), tr C and tr C^2.
-    below, above : (...), variances that stand for `along` at the bounds of the 95 % interval, where the true vector has
-        another direction; infinite where it may be zero.
+    plane : (...) each, `mixed`, `across` and `further` of `vector_noise.VectorNoise`; 0: not known.
+    far : (...), variances for the 95 % interval over those for the 68 % interval.
 
     Examples
     --------
@@ -67,8 +74,7 @@ def interval(
     >>> [bool(low == 0) for low in found.low]
     [True, False]
     """
-    below, above = (along if part is None else part for part in (below, above))
-    flat = np.stack([length, along, total, square, below, above]).reshape(6, -1)
+    flat = np.stack(np.broadcast_arrays(length, along, total, square, *plane, far)).reshape(8, -1)
     out = np.empty((4, length.size))
     table, nodes = _table()[0], (COMPONENTS, ALONG, OBSERVED)
     for_ranges(length.size, lambda start, stop: lengths(table, nodes, flat, out, start, stop))

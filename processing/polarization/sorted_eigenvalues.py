@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
+from processing.polarization.length_kernels import interpolate
 from processing.polarization.magnitude import NORMAL_95
-from processing.polarization.vector_kernels import interpolate
 
 #: Nodes of the table along both gaps, in units of the noise of an element.
 GAPS = np.array([0, 1, 2, 3, 4, 5, 6.5, 8.5, 11, 14.0])

@@ -18,16 +18,18 @@ class VectorNoise(NamedTuple):
     ----------
     along : variance along v.
     total, square : tr C and tr C^2.
-    below, above : square of how far below and above |v| lengths reach within the ellipsoid of 1.96 errors about v, over
-        1.96^2: the variance along v, where noise is alike in all directions. `below` is infinite where v may be zero.
+    mixed, across : noise along v turns it: the square of its covariance with the direction to which it does, and the
+        variance along that.
+    further : likewise the square of the covariance of that direction with all others but v.
     packed : (6, ...), of the first three components: 00, 11, 22, 01, 12, 02; NaN where there are fewer.
     """
 
     along: Array
     total: Array
     square: Array
-    below: Array
-    above: Array
+    mixed: Array
+    across: Array
+    further: Array
     packed: Array
 
 
@@ -47,8 +49,8 @@ def of_slopes(covariance: NDArray[np.floating], vector: RealArray, slopes: RealA
 
 def _each(covariance: NDArray[np.floating], shape: tuple[int, ...], loop: Callable[..., object]) -> VectorNoise:
     each = np.ascontiguousarray(np.moveaxis(covariance.reshape(-1, 16, 16), 0, -1), dtype=np.float32)
-    out = np.empty((11, each.shape[-1]), np.float32)
+    out = np.empty((12, each.shape[-1]), np.float32)
     for_ranges(each.shape[-1], lambda start, stop: loop(each, out, start, stop))
     found = out.reshape(-1, *shape).astype(float)
-    along, total, square, below, above = found[:5]
-    return VectorNoise(along, total, square, below, above, found[5:])
+    along, total, square, mixed, across, further = found[:6]
+    return VectorNoise(along, total, square, mixed, across, further, found[6:])

@@ -31,8 +31,8 @@ MATRICES[:3] = np.zeros((4, 4)), IDEAL_DEPOLARIZER, np.full((4, 4), np.nan)
 MATRICES[3, 0, 1] = 2 * MATRICES[3, 0, 0]
 FACTORS = RNG.normal(scale=0.02, size=(N, 16, 16))
 COVARIANCE = FACTORS @ np.swapaxes(FACTORS, 1, 2)
-SLOPES = RNG.normal(size=(2, N, 16))
-VECTORS = RNG.normal(scale=0.3, size=(2, N))
+SLOPES = RNG.normal(size=(3, N, 16))
+VECTORS = RNG.normal(scale=0.3, size=(3, N))
 NAMES, ANALYZERS = ("90", "45", "135", "0"), np.array([[1, -1, 0], [1, 0, 1], [1, 0, -1], [1, 1, 0]]) / 2
 LAYOUT = MosaicLayout.of((("90", "45"), ("135", "0")), NAMES, ANALYZERS)
 FRAME = (1000 + 900 * np.sin(np.hypot(*np.mgrid[1:150:162j, 7:177:170j]) / 4)).astype(np.float32)
@@ -44,8 +44,8 @@ SEEN, ALONG = RNG.permuted(np.linspace(0, 40, N)), np.geomspace(0.01, 100, N)
 
 
 def intervals() -> magnitude.Interval:
-    below = np.where(SEEN > 5, ALONG, np.inf)
-    return magnitude.interval(SEEN, ALONG, 3 * ALONG, 2 * ALONG**2, below=below, above=1.1 * ALONG)
+    plane = 0.3 * ALONG**2, 0.7 * ALONG, 0.1 * ALONG**2
+    return magnitude.interval(SEEN, ALONG, 3 * ALONG, 4 * ALONG**2, plane=plane, far=np.where(SEEN > 5, 1.1, 1.0))
 
 
 def table() -> Any:
