@@ -18,6 +18,9 @@ LEAST = 0.55
 _STEPS, _CLOSE, _ALIKE = 8, 0.02, 0.2
 #: Observed length over sqrt(tr C) up to which an interval is that of the table alone, and where its share ends.
 NEAR, FAR = 1.0, 1.5
+#: [standard errors] By which one noise across lengthens a vector: up to the first the root counts in full, beyond the
+#: second not at all. A vector along a direction of little noise may have a part across that noise has hidden.
+LITTLE, MUCH = 0.4, 0.8
 
 
 def _mixed(table: Array, i: Any, x: Any, j: Any, y: Any, k: Any, z: Any) -> Any:
@@ -156,10 +159,11 @@ def _lengths_at_once(table: Array, nodes: tuple[Array, ...], given: Array, out: 
             wide = np.sqrt(far) if n > 1 else np.ones_like(far)
             one = np.where(valid, seen / wide, 0.0)
             k, z = _places(one, nodes[2])
-            end = _mixed(table[n], i, x, j, y, k, z)
+            end = _mixed(table[n], i, x, j, y, k, z) + np.maximum(one - nodes[2][-1], 0.0)
             share = np.clip((one / np.sqrt(components) - NEAR) / (FAR - NEAR), 0.0, 1.0)
             plane = _plane(one, along / u, total / u, square / u**2, mixed / u**2, across / u, further / u**2)
             bound = _bounds_at_once((1 - 2 * (n % 2)) * DEVIATES[n // 2], plane)
+            share *= np.clip((MUCH - plane[5] * plane[6] / 2) / (MUCH - LITTLE), 0.0, 1.0)
             # The noise along the observed vector can be far less than that along the true one.
             share = np.where((n == 3) & (bound > end), 1.0, share)
             bound = np.where((across == 0) & (one < nodes[2][-1]), 0.0, bound)
@@ -201,6 +205,8 @@ def lengths(table, nodes, given, out, start, stop):  # type: ignore[no-untyped-d
             if (share > 0 or n == 3) and (across > 0 or one >= nodes[2][-1]):
                 if n == 0 or plane[0] == 0 or given[7, p] != 1:
                     plane = _place_in_plane(one, along, total, square, mixed, across, further)
+                hidden = (MUCH - plane[5] * plane[6] / 2) / (MUCH - LITTLE)
+                share = min(share, 1.0) * min(max(hidden, 0.0), 1.0)
                 bound = _bound((1 - 2 * (n % 2)) * DEVIATES[n // 2], plane)
             if bound > 0 and share >= 1:
                 ends[n] = bound * wide
@@ -210,7 +216,7 @@ def lengths(table, nodes, given, out, start, stop):  # type: ignore[no-untyped-d
                 j, y = _place(along / np.sqrt(components), nodes[1])
             k = min(int(one / step), last - 1)
             z = min(one / step - k, 1.0)
-            ends[n] = _at(table[n], i, x, j, y, k, z)
+            ends[n] = _at(table[n], i, x, j, y, k, z) + max(one - nodes[2][last], 0.0)
             if bound > 0:
                 share = 1.0 if n == 3 and bound > ends[n] else max(share, 0.0)
                 ends[n] += share * (bound - ends[n])
