@@ -83,8 +83,7 @@ def set_magnitudes(
             by = [_turned(turn, deviate) for deviate in (1.0, NORMAL_95)]
             wide, far = scale * by[0], by[1] / by[0]
         length = np.asarray(quantity.value, dtype=float)
-        total, square = wide * noise.total, wide**2 * noise.square
-        along = wide * noise.along
+        along, total, square = wide * noise.along, wide * noise.total, wide**2 * noise.square
         plane = (wide**2 * noise.mixed, wide * noise.across, wide**2 * noise.further)
         if name.startswith("dominant_"):
             # A process is bent as well: what noise across adds to other lengths may be missing. Its mean square:

@@ -20,7 +20,7 @@ _STEPS, _CLOSE, _ALIKE = 8, 0.02, 0.2
 NEAR, FAR = 1.0, 1.5
 #: [standard errors] By which one noise across lengthens a vector: up to the first the root counts in full, beyond the
 #: second not at all. A vector along a direction of little noise may have a part across that noise has hidden.
-LITTLE, MUCH = 0.4, 0.8
+SWAY = (0.4, 0.8)
 
 
 def _mixed(table: Array, i: Any, x: Any, j: Any, y: Any, k: Any, z: Any) -> Any:
@@ -102,6 +102,15 @@ _place_in_plane, _root = compiled(**FAST)(_plane), compiled(**FAST)(_modified_ro
 _guess, _length_of, _fewer = (compiled(**FAST)(each) for each in (_first_guess, _length_at, _shrunk))
 
 
+def _share_of_root(over_noise: Any, variance: Any, scale: Any) -> Any:
+    """Part that the root has in a bound, the rest being the table's, of a length over sqrt(tr C) and its `_plane`."""
+    long = np.minimum(np.maximum((over_noise - NEAR) / (FAR - NEAR), 0.0), 1.0)
+    return long * np.minimum(np.maximum((SWAY[1] - variance * scale / 2) / (SWAY[1] - SWAY[0]), 0.0), 1.0)
+
+
+_share = compiled(**FAST)(_share_of_root)
+
+
 def _places(values: Array, nodes: Array) -> tuple[NDArray[np.intp], Array]:
     i = np.clip(np.searchsorted(nodes, values, side="right") - 1, 0, len(nodes) - 2)
     return i, np.clip((values - nodes[i]) / (nodes[i + 1] - nodes[i]), 0.0, 1.0)
@@ -160,10 +169,9 @@ def _lengths_at_once(table: Array, nodes: tuple[Array, ...], given: Array, out: 
             one = np.where(valid, seen / wide, 0.0)
             k, z = _places(one, nodes[2])
             end = _mixed(table[n], i, x, j, y, k, z) + np.maximum(one - nodes[2][-1], 0.0)
-            share = np.clip((one / np.sqrt(components) - NEAR) / (FAR - NEAR), 0.0, 1.0)
             plane = _plane(one, along / u, total / u, square / u**2, mixed / u**2, across / u, further / u**2)
             bound = _bounds_at_once((1 - 2 * (n % 2)) * DEVIATES[n // 2], plane)
-            share *= np.clip((MUCH - plane[5] * plane[6] / 2) / (MUCH - LITTLE), 0.0, 1.0)
+            share = _share_of_root(one / np.sqrt(components), plane[5], plane[6])
             # The noise along the observed vector can be far less than that along the true one.
             share = np.where((n == 3) & (bound > end), 1.0, share)
             bound = np.where((across == 0) & (one < nodes[2][-1]), 0.0, bound)
@@ -199,14 +207,12 @@ def lengths(table, nodes, given, out, start, stop):  # type: ignore[no-untyped-d
         for n in range(4):
             wide = np.sqrt(given[7, p]) if n > 1 else 1.0
             one = seen / wide
-            share = (one / np.sqrt(components) - NEAR) / (FAR - NEAR)
-            bound = 0.0
+            over_noise, share, bound = one / np.sqrt(components), 0.0, 0.0
             # Of noise that is known along the vector alone the table is all.
-            if (share > 0 or n == 3) and (across > 0 or one >= nodes[2][-1]):
+            if (over_noise > NEAR or n == 3) and (across > 0 or one >= nodes[2][-1]):
                 if n == 0 or plane[0] == 0 or given[7, p] != 1:
                     plane = _place_in_plane(one, along, total, square, mixed, across, further)
-                hidden = (MUCH - plane[5] * plane[6] / 2) / (MUCH - LITTLE)
-                share = min(share, 1.0) * min(max(hidden, 0.0), 1.0)
+                share = _share(over_noise, plane[5], plane[6])
                 bound = _bound((1 - 2 * (n % 2)) * DEVIATES[n // 2], plane)
             if bound > 0 and share >= 1:
                 ends[n] = bound * wide
@@ -218,7 +224,7 @@ def lengths(table, nodes, given, out, start, stop):  # type: ignore[no-untyped-d
             z = min(one / step - k, 1.0)
             ends[n] = _at(table[n], i, x, j, y, k, z) + max(one - nodes[2][last], 0.0)
             if bound > 0:
-                share = 1.0 if n == 3 and bound > ends[n] else max(share, 0.0)
+                share = 1.0 if n == 3 and bound > ends[n] else share
                 ends[n] += share * (bound - ends[n])
             ends[n] *= wide
         low, high = ends[0], ends[1]
