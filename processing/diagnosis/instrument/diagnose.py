@@ -96,7 +96,10 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     judgement = Judgement(
         named=bool(names.named or switched or posterior.any_cause),
         sure=bool(names.sure or switched),
-        structure=any(has_structure(validation, r) for r in after) or bool(names.untold),
+        # What no name explains is as open as structure that is left.
+        structure=any(has_structure(validation, r) for r in after)
+        or bool(names.untold)
+        or (posterior.any_cause and not names.named),
         observable=bool(observable_effects(posterior)),
         figures=checks(validation, solved),
         # Where there is nothing to apply, nothing is said of what it would do.
