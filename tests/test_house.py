@@ -91,9 +91,8 @@ def two_tests(tmp_path):
     )
 
 
-@pytest.mark.parametrize("options", [("-n", "1")])
-def test_long_tests_are_left_out_with_a_line(two_tests, options):
-    output = two_tests(*options)
+def test_long_tests_are_left_out_with_a_line(two_tests):
+    output = two_tests("-n", "1")
     assert "1 passed" in output
     assert "1 long tests left out; run them too: ./lab test --all" in output
 
