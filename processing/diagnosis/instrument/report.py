@@ -85,7 +85,8 @@ def _pattern(judged: Judged, problem: InstrumentProblem, k: int) -> Figure:
         axis.set_ylabel("row, pixels")
         axis.set_facecolor("0.85")
     upper.suptitle("leading pattern of the residual: its amplitude over the image")
-    upper.colorbar(shown, ax=axes, label="residual / noise of one intensity", extend=clipped(maps[0], -wide, wide))
+    label, extend = "residual / noise of one intensity", clipped(maps[0], -wide, wide)
+    upper.colorbar(shown, ax=axes, label=label, extend=extend, panchor=False)
     left, right = lower.subplots(1, 2, width_ratios=[1.6, 1])
     for line, name in zip(states, names, strict=True):
         left.plot(line, "o-", ms=3, label=name)
