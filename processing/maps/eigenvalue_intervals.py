@@ -101,11 +101,11 @@ def set_entropy(planes: Planes, xi: Array, slopes: RealArray, image: MuellerImag
     by_index = np.fmax(*(np.abs(at(index + side * error) - middle) for side in (-1, 1)))
     apart = np.sqrt(np.maximum(total - np.square(by_index), 0))
     for side, end in ((-1, 1), (1, 0)):
-        unit = np.abs(bounds[end] - index) / NORMAL_95
-        off_pure = (1 - index) / unit
-        near = positive(off_pure)
-        for level, (deviate, far) in enumerate(((1.0, index - side * error), (NORMAL_95, bounds[end]))):
-            nearest = np.where(off_pure < 4, 1 - near[level][1 - end] * unit, far)
+        of_95 = np.abs(bounds[end] - index) / NORMAL_95
+        levels = ((1.0, index - side * error, error), (NORMAL_95, bounds[end], of_95))
+        for level, (deviate, far, unit) in enumerate(levels):
+            off_pure = (1 - index) / unit
+            nearest = np.where(off_pure < 4, 1 - positive(off_pure)[level][1 - end] * unit, far)
             moved = at(np.fmin(nearest, far) if side > 0 else nearest) - middle
             ends.append(np.clip(middle + side * np.hypot(moved, deviate * apart), 0, 1))
     low, low_95, high, high_95 = ends

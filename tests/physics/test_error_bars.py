@@ -287,6 +287,14 @@ def test_noise_that_differs_between_directions_is_known(quantity: str) -> None:
     assert min(cell.in_95 for cell in rows) > 0.915
 
 
+def test_entropy_of_pure_samples_covers_not_much_too_often() -> None:
+    """Noise of poor states grows along the index: the 68 % interval took the wider unit and covered 84 %."""
+    pure = ("mirror", "air", "polarizer 1:10")
+    covered = [c.in_68 for c in shared_cells("127 degrees, 9 to 1, 41", 1, 60, 1000, pure) if c.quantity == "entropy"]
+    assert np.mean(covered) < 0.8
+    assert min(covered) > 0.64
+
+
 @pytest.mark.parametrize(("instrument", "electrons"), [("RGB950's 40", 2000), ("24 others", 60)])
 def test_entropy_covers_at_both_its_ends_and_where_an_eigenvalue_may_be_zero(instrument: str, electrons: float) -> None:
     """95 % intervals covered 87 to 89 %; a pure sample's estimate was above the truth by its error."""
