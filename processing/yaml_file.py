@@ -1,6 +1,7 @@
 """Load a YAML file into a pydantic model, with errors that name the file, the line and the key."""
 
 import functools
+import json
 import math
 import os
 import sys
@@ -212,6 +213,12 @@ def _named_files(path: Path, before: tuple[Any, ...], visited: set[Path]) -> Ite
 
 def dump_yaml(value: BaseModel) -> str:
     """YAML text of a model; `parse_yaml` of it gives an equal model. Lists of numbers are written in a row."""
+    return _text(json.dumps(value.model_dump(mode="json", exclude_none=True)))
+
+
+@functools.lru_cache(maxsize=64)
+def _text(document: str) -> str:
+    """YAML text of a JSON document: a campaign writes the same few into every capture."""
     from io import StringIO
 
     yaml = YAML()
@@ -219,7 +226,7 @@ def dump_yaml(value: BaseModel) -> str:
     # A key that is folded over two lines, as one with a capture's name would be, cannot be read back.
     yaml.width = sys.maxsize
     buffer = StringIO()
-    yaml.dump(_numbers_in_rows(value.model_dump(mode="json", exclude_none=True)), buffer)
+    yaml.dump(_numbers_in_rows(json.loads(document)), buffer)
     return buffer.getvalue()
 
 

@@ -11,7 +11,7 @@ from functools import cache
 from drivers import clock as driver_clock
 
 #: Who attends the patient clock looks at it this often; it runs no further than this past the last time that all did.
-BEAT_S = 0.005
+BEAT_S = 0.01
 LONGEST_BEAT_S = 0.02
 
 

@@ -137,6 +137,7 @@ def load_reflectance(path: Path | str) -> Any:
     return load_yaml(path, model)
 
 
+@cache
 def _model_here(kind: str) -> type[BaseModel] | None:
     """The model of one module of this folder; its neighbours, some slow to import, stay where they are.
 

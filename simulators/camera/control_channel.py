@@ -90,6 +90,9 @@ class ControlChannel:
         """Answer no more; closing twice is harmless."""
         channel, self._socket = self._socket, None
         if channel is not None and self._thread is not None:
+            # A packet of nobody ends the wait for the next one.
+            with contextlib.suppress(OSError):
+                channel.sendto(b"", channel.getsockname())
             self._thread.join()
             for sock in self._listeners:
                 sock.close()
