@@ -104,11 +104,13 @@ def _descend(
         h = sums.curvature[use].sum(axis=0) + np.diag(weak)
         move = free & ~((x <= lower) & (g > 0)) & ~((x >= upper) & (g < 0))
         gm, hm = g[move], h[np.ix_(move, move)]
-        if not move.any() or (not damping and gm @ np.linalg.solve(hm, gm) < least_gain + LEAST_RELATIVE * abs(cost)):
+        if not move.any():
             break
         while True:
             step = np.zeros_like(x)
             step[move] = -np.linalg.solve(hm + damping * np.diag(np.diag(hm)), gm)
+            if not damping and -gm @ step[move] < least_gain + LEAST_RELATIVE * abs(cost):
+                return Fit(x, sums, float(sums.excess[use].sum()))
             tried = np.clip(x + step, lower, upper)
             # Derivatives are most of the work; a step that is refused needs none.
             now = _penalize(problem.sums(space, tried, derivatives=False), weak, tried, use, reference=reference)
