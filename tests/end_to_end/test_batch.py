@@ -15,19 +15,24 @@ from processing.storage.products.product import Product
 STATES, SHAPE = 24, (6, 8)
 
 
-@pytest.fixture
-def lab(synthetic_capture, configs, tmp_path) -> Path:
+@pytest.fixture(scope="module")
+def captures(captures_in, configs, tmp_path_factory) -> Path:
     """A folder with three captures: one_2, one_10 and `deeper/other`."""
-    folder = tmp_path / "captures"
+    folder = tmp_path_factory.mktemp("lab") / "captures"
     (folder / "deeper").mkdir(parents=True)
     text = (configs / "instruments" / "drr_5to1.yaml").read_text()
     detector = {"gain_e_per_count": 2.5, "read_noise_e": 4.0, "bits": 12}
-    psg = np.arange(STATES) * 7.5
+    psg, write = np.arange(STATES) * 7.5, captures_in(folder)
     for seed, name in enumerate(("one_2", "one_10", "deeper/other")):
         frames = np.random.default_rng(seed).integers(400, 3000, (STATES, 1, *SHAPE), dtype=np.uint16)
-        capture = synthetic_capture(frames, {"psg": psg, "psa": psg * 4.91}, instrument_yaml=text, detector=detector)
-        capture.rename(folder / f"{name}.h5")
+        write(frames, {"psg": psg, "psa": psg * 4.91}, name=f"{name}.h5", instrument_yaml=text, detector=detector)
     return folder
+
+
+@pytest.fixture
+def lab(captures, tmp_path) -> Path:
+    """The captures in a folder of the test's own."""
+    return Path(shutil.copytree(captures, tmp_path / "captures"))
 
 
 @pytest.fixture

@@ -66,8 +66,8 @@ SHOWN_FOLDERS = ("configs", "examples", "benchmarks", "tests/data")
 SMALLER = {
     "configs/rigs/simulated.yaml": {
         "clock_speed: 10": "clock_speed: 50",
-        "rows: 600": "rows: 96",
-        "columns: 600": "columns: 96",
+        "rows: 600": "rows: 48",
+        "columns: 600": "columns: 48",
     },
     "configs/campaigns/red_sphere.yaml": {"stop: 90": "stop: 20", "[451, 662]": "[662]"},
 }

@@ -76,6 +76,7 @@ def test_killed_or_frozen_the_light_is_shut_and_the_axes_stop(
     assert child.wait() == -signal.SIGKILL
     # What was done is there, and the rig is free again.
     assert intact(partial) >= 5
+    simulation.clock.speed = 50
     acquire.made("--resume", partial)
     assert "guard rests" in journal.read_text()
 
