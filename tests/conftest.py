@@ -204,7 +204,7 @@ def run_main(capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str,
 
 @pytest.fixture
 def figures() -> None:
-    """For tests of which `acquire` shall draw the figure of a capture."""
+    """For tests of which `acquire` and `process` shall draw the figure of a capture or product."""
 
 
 @pytest.fixture
@@ -224,11 +224,15 @@ def acquire(
 
 
 @pytest.fixture
-def process(run_main: Callable[..., tuple[int, str, str]]) -> Any:
-    """Runs `process`, as `run_main` does."""
+def process(
+    run_main: Callable[..., tuple[int, str, str]], request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Any:
+    """Runs `process`, as `run_main` does; without `figures` the figure of a product is an empty file."""
     from processing.commands.application import main
     from tests.commands import Program
 
+    if "figures" not in request.fixturenames:
+        monkeypatch.setattr("processing.reports.figures.draw_product", lambda path, figure: figure.touch())
     return Program(partial(run_main, main))
 
 

@@ -9,7 +9,7 @@ from processing.storage.captures.capture import Capture, CaptureError
 DEVIATIONS = 6.0
 #: A state is left out if more than this share of its pixels is cut off.
 MOST = 0.01
-#: Rows of a frame that are looked at.
+#: Rows of a frame that are looked at. A frame of fewer than twice as many is read at once.
 ROWS = 32
 
 
@@ -25,10 +25,13 @@ def without_cut_off(capture: Capture, states: NDArray[np.int64]) -> tuple[NDArra
     if not capture.integer_counts or gain is None or detector.black_level_counts <= DEVIATIONS * read / gain:
         return states, []
     height = capture.frame_shape[0]
-    looked_at = [slice(row, row + 1) for row in range(0, height, max(1, height // ROWS))]
+    every = max(1, height // ROWS)
 
     def share(state: np.int64) -> float:
-        return float(np.mean([np.mean(capture.frames(int(state), rows) <= 0) for rows in looked_at]))
+        if every == 1:
+            return float(np.mean(capture.frames(int(state)) <= 0))
+        rows = (slice(row, row + 1) for row in range(0, height, every))
+        return float(np.mean([np.mean(capture.frames(int(state), row) <= 0) for row in rows]))
 
     bad = np.array([share(state) > MOST for state in states])
     if bad.all():

@@ -152,6 +152,7 @@ def test_an_empty_folder_is_told(process, tmp_path):
     assert (code, err) == (2, [f"error: {tmp_path} holds no captures. Give files, or the folder that they are in."])
 
 
+@pytest.mark.usefixtures("figures")
 @pytest.mark.long
 def test_a_missing_picture_is_drawn_again(lab, process):
     names = lab / "one_2.h5", lab / "one_10.h5"

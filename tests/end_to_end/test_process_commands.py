@@ -48,6 +48,7 @@ def measured(tmp_path: Path, instrument: Path) -> Measured:
     return Measured(tmp_path, instrument, np.diag([1.0, 1.0, -1.0, -1.0]))
 
 
+@pytest.mark.usefixtures("figures")
 @pytest.mark.long
 def test_import_reduce_figure(tmp_path: Path, instrument: Path, process: Run) -> None:
     data = Measured(tmp_path, instrument, np.diag([1.0, 1.0, -1.0, -1.0]), ".tif")
@@ -175,6 +176,7 @@ def test_camera_of_a_capture_without_repeats(measured: Measured, instrument: Pat
     assert "no dark states" in process.refused("camera", measured.folder / "states.h5")
 
 
+@pytest.mark.usefixtures("figures")
 def test_xi0_reduces_first_and_reuses_the_product(
     measured: Measured, tmp_path: Path, instrument: Path, process: Run
 ) -> None:

@@ -45,6 +45,7 @@ def capture(synthetic_capture, configs: Path) -> Path:
     )
 
 
+@pytest.mark.usefixtures("figures")
 @pytest.mark.long
 def test_all_maps_with_errors(process: Run, capture: Path, tmp_path: Path) -> None:
     out, figure = tmp_path / "q.h5", tmp_path / "q.png"

@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dlauum, dtrtri
+from scipy.linalg.lapack import dlauum, dtrtri, dtrtrs
 from scipy.special import betaln
 
 from processing.arrays import Array
@@ -214,7 +213,9 @@ class Sets:
         active = np.concatenate([np.zeros(0, dtype=np.int64), *(self.groups[i].index for i in on)])
         prior = np.concatenate([np.zeros(0), *(np.full(self.groups[i].index.size, state.tau[i] ** -2.0) for i in on)])
         lower = _root(self.form.curvature[np.ix_(active, active)] / u + np.diag(prior))
-        right = solve_triangular(lower, self.form.gradient[active] / u, lower=True) if active.size else np.zeros(0)
+        # As `solve_triangular` does it, which takes twenty times as long to find that out.
+        gradient = self.form.gradient[active] / u
+        right = np.asarray(dtrtrs(lower.T, gradient, lower=0, trans=1)[0]) if active.size else gradient
         excess = self.form.excess - u * float(right @ right)
         # What the width of the prior costs: log det (I + T H / u).
         width = 2 * float(np.log(np.diag(lower)).sum()) - float(np.log(prior).sum())

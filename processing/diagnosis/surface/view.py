@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import astuple, replace
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -113,7 +113,7 @@ class SurfaceView:
         # Of an effect of the optics the surface knows nothing.
         return _once(
             self._dominant,
-            astuple(changes),
+            _values(changes),
             lambda: self._complete(changes).dominant(self.geometry(changes), self.index),
         )
 
@@ -146,7 +146,7 @@ class SurfaceView:
             support_rad=changes.support_rad,
             support_log_depth=changes.support_log_depth,
         )
-        below = _once(self._below, astuple(material), lambda: self._from_below(material))
+        below = _once(self._below, _values(material), lambda: self._from_below(material))
         slope = 1 + _disc(0.0, 1.0)[:, ::2] @ np.array(changes.support_slope)
         column = np.einsum("l,t,ltpi->pi", [1.0, changes.support_law], slope, below)
         light = np.zeros((len(self.points), 4, 4))
@@ -180,6 +180,11 @@ class SurfaceView:
             columns[0, k] = weight[:, None] * complete.dominant(below, self.index)[..., 0]
             columns[1, k] = (theta_h / (np.pi / 2))[:, None] * columns[0, k]
         return columns
+
+
+def _values(changes: ReflectanceChanges) -> tuple[object, ...]:
+    # They are numbers and tuples of numbers, which `astuple` would copy one by one.
+    return tuple(vars(changes).values())
 
 
 def _once(cache: dict[tuple[object, ...], Kept], key: tuple[object, ...], make: Callable[[], Kept]) -> Kept:
