@@ -6,7 +6,7 @@ import pytest
 
 from drivers.errors import DeviceError, MotionFailed, NotHomedError, PortNotFound, ReplyError, ReplyTimeout, WrongDevice
 from simulators.clock import patient_clock
-from simulators.conformance.served_axes import AxisTests
+from simulators.conformance.served_axes import FAST, AxisTests
 from simulators.serial.reply_faults import Fault
 
 
@@ -78,6 +78,7 @@ class AxisFaults(AxisTests):
             with pytest.raises(ReplyTimeout, match="power"):
                 axis.read_position()
             served.emulator.faults.clear()
+            served.emulator.clock.speed = FAST
             while served.emulator.axes[0].is_moving():
                 time.sleep(0.01)
             assert axis.read_position().deg == pytest.approx(served.emulator.true_deg(0), abs=0.01)
