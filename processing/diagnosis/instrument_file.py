@@ -5,11 +5,9 @@ from pathlib import Path
 from processing.diagnosis.search.result import Diagnosis
 from processing.errors import ProcessError
 from processing.instrument.model import Dispersive, EffectParameter, InstrumentModel
+from processing.reduction.flat import SAME_NM
 from processing.whole_file import write_new_text
 from processing.yaml_file import ConfigError, dump_yaml, parse_yaml
-
-#: [nm] Difference below which two wavelengths are the same in a file that is written.
-SAME_NM = 0.5
 
 
 class WriteError(ProcessError):

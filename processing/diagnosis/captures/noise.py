@@ -15,13 +15,20 @@ from processing.diagnosis.captures.black_jitter import black_jitter
 from processing.diagnosis.captures.capture_data import CaptureData, SharedNoise, mixed_part
 from processing.diagnosis.captures.outliers import Whitened
 from processing.diagnosis.search.range_of import NEARLY_ZERO
-from processing.diagnosis.search.rules import DARK_NOISE_OFF, LEAST_PART, LITTLE, NOISE_OFF, NOISE_SURE, SHOWN, SMALL
+from processing.diagnosis.search.rules import (
+    DARK_NOISE_OFF,
+    FEWEST_FREE,
+    FEWEST_OF_MANY,
+    LEAST_PART,
+    LITTLE,
+    NOISE_OFF,
+    NOISE_SURE,
+    SHOWN,
+    SMALL,
+    TILES,
+)
 from processing.storage.captures.capture import CaptureError
 
-#: [pixels] Along a side of an image, below which it tells nothing about noise.
-NARROWEST = 12
-#: [directions] Over the states that the model leaves over, below which they tell nothing about noise.
-FEWEST_FREE_FOR_NOISE = 4
 #: [pixels] Distance over which noise is no longer alike, and the image has hardly changed; and one more.
 NOT_ALIKE_PX = 3
 #: [rows, or columns] Distance of those whose means are compared: next to each other they may share noise.
@@ -68,16 +75,16 @@ def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
     Raises CaptureError: the frames have none.
     """
     height, width = data.usable.shape
-    if min(height, width) < NARROWEST:
+    if min(height, width) < TILES:
         return None
-    rows = min(height, max(NARROWEST, MOST_FITTED // (width * data.values_per_pixel)))
+    rows = min(height, max(TILES, MOST_FITTED // (width * data.values_per_pixel)))
     part = slice((height - rows) // 2, (height - rows) // 2 + rows)
     looked_at = np.zeros(data.usable.shape, dtype=bool)
     looked_at[part] = (data.usable & ~data.clipped)[part]
-    if looked_at.sum() < NARROWEST**2:
+    if looked_at.sum() < FEWEST_OF_MANY:
         return None
     white = Whitened.of(data, a, looked_at)
-    if white.outside.shape[1] < FEWEST_FREE_FOR_NOISE:
+    if white.outside.shape[1] < FEWEST_FREE:
         return None
     projector = white.projector(np.ones(white.y.shape[1], dtype=bool))
     floor = np.repeat(data.floor, data.signal.shape[1])[data.row_counts] / white.level**2

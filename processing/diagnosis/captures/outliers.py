@@ -20,22 +20,24 @@ from scipy.special import ndtri
 from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.search.range_of import NEARLY_ZERO, inside_and_outside, range_of
-from processing.diagnosis.search.rules import ENOUGH_PX, FEWEST_OF_MANY, LITTLE, MOSTLY, OUTSTANDING
+from processing.diagnosis.search.rules import (
+    ENOUGH_PX,
+    FEWEST_FREE,
+    FEWEST_OF_MANY,
+    GROWTH,
+    LITTLE,
+    MOST_SPOILT,
+    MOSTLY,
+    OUTSTANDING,
+    SMALL,
+)
 
 #: [robust standard deviations] From which on an intensity is a hit: the largest of 10^9 normal ones is 6.1.
 HIT = 8.0
-#: [of the mean variance] Least one that is taken for the usual of a pixel.
-DIMMEST = 0.1
-#: [directions] Over the states that the model leaves over, below which nothing can stand out.
-FEWEST_FREE_FOR_HITS = 8
 #: [states] Of one pixel that are hits; with more of them it is a bad pixel.
 MOST_STRUCK = 4
-#: [of the pixels of a state] Beyond which what stands out is no hit: the frame itself moved, or belongs to nothing.
-MOST_HITS = 0.02
 #: [of the usual variance] From which on a pixel is bad, and up to which the noise of a bright state is believed.
 BAD_PIXEL = 4.0
-#: [standard deviations] By which its variance has to stand out as well, where there are few states.
-BAD_DEVIATIONS = 10.0
 #: [pixels] Side of the square of pixels around: an image that moves makes more of them noisy, a bad pixel is alone.
 SIDE_AROUND = 5
 #: [of the 25 pixels around] That may be as bad: at an edge that moves more of them are.
@@ -45,14 +47,6 @@ ALSO_BAD = 0.2
 LEAST_MISFIT = 0.015
 #: [1] Times by which its misfit is larger, squared, than the next one that is left without it.
 AGAINST_NEXT = 8.0
-#: [of the states] That may be bad.
-MOST_BAD_FRAMES = 0.1
-#: [condition] Of what a state leaves free, from which on the others do not predict it.
-UNPREDICTED = 1e4
-#: [states] With most left over, of which pairs are tried in each other's place.
-SUSPECTS_OF_EXCHANGE = 12
-#: [of the largest eigenvalue of noise] From which on a direction over the states is structure, which all pixels share.
-BEYOND_NOISE = 1.15
 
 #: [standard deviations] Median of absolute values of normal ones.
 NORMAL_MAD = float(ndtri(0.75))
@@ -95,8 +89,8 @@ class Whitened:
         scale = robust_scale(r).astype(np.float32)
         inner = (outside.T @ np.clip(r, -OUTSTANDING * scale, OUTSTANDING * scale, out=r)).astype(float)
         value, vector = np.linalg.eigh(inner @ inner.T / inner.shape[1])
-        # Largest eigenvalue of noise over the median one (Marchenko and Pastur).
-        edge = BEYOND_NOISE * (1 + np.sqrt(len(value) / inner.shape[1])) ** 2
+        # Largest eigenvalue of noise over the median one (Marchenko and Pastur); beyond it all pixels share structure.
+        edge = GROWTH * (1 + np.sqrt(len(value) / inner.shape[1])) ** 2
         # At least half of the directions are left to tell what noise is.
         half = len(value) // 2
         structure = self.outside @ vector[:, half:][:, value[half:] > edge * np.median(value)]
@@ -137,7 +131,7 @@ def bad_frames(data: CaptureData, a: Array) -> tuple[BadFrame, ...]:
     state_indices = [k for k in range(states) if data.row_counts[k * channels]]
     bad: list[BadFrame] = []
     before = moments.suspect(state_indices)
-    while before is not None and len(bad) < MOST_BAD_FRAMES * states:
+    while before is not None:
         subset = [k for k in state_indices if k != before.state]
         after = moments.suspect(subset)
         if after is None or before.misfit < LEAST_MISFIT or before.misfit**2 < AGAINST_NEXT * after.misfit**2:
@@ -182,7 +176,7 @@ class _Moments:
             block = slice(j * c, (j + 1) * c)
             free = p[block, block]
             # A residual, over what is free of the state, is its difference from the prediction by the others.
-            if np.linalg.cond(free) > UNPREDICTED:
+            if np.linalg.cond(free) * NEARLY_ZERO > 1:
                 continue
             back = np.linalg.inv(free)
             misfit = float(np.sqrt(max(np.trace(back @ beyond[block, block] @ back.T), 0.0) / c))
@@ -195,8 +189,7 @@ class _Moments:
         p, beyond = self._fitted(states)
         least, pair = (1 - MOSTLY) * self.excess(states), None
         where = np.arange(len(p)).reshape(len(states), self._channels)
-        worst = np.argsort(-np.diag(p @ beyond @ p).reshape(where.shape).sum(axis=1))[:SUSPECTS_OF_EXCHANGE]
-        for i, j in combinations(sorted(worst.tolist()), 2):
+        for i, j in combinations(range(len(states)), 2):
             order = where.copy()
             order[[i, j]] = order[[j, i]]
             excess = float(np.sum(p * beyond[np.ix_(order.reshape(-1), order.reshape(-1))]))
@@ -228,11 +221,11 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
     if good.sum() < FEWEST_OF_MANY:
         return outliers
     white = Whitened.of(data, a, good)
-    if white.outside.shape[1] < FEWEST_FREE_FOR_HITS:
+    if white.outside.shape[1] < FEWEST_FREE:
         return outliers
     # What is struck tells a noise of its own: no state is believed to be far brighter than the usual one of its pixel.
-    usual = np.maximum(np.median(white.variance, axis=0), np.float32(DIMMEST))
-    share = np.sqrt(np.clip(white.variance / usual, np.float32(DIMMEST), np.float32(BAD_PIXEL)))
+    usual = np.maximum(np.median(white.variance, axis=0), np.float32(SMALL))
+    share = np.sqrt(np.clip(white.variance / usual, np.float32(SMALL), np.float32(BAD_PIXEL)))
     clean = np.ones(white.y.shape[1], dtype=bool)
     # Twice: what was struck is no structure of the image.
     for _ in range(2):
@@ -282,14 +275,15 @@ def _hits(
             if far > HIT * max(np.sqrt(square), 1.0):
                 selection = struck.copy(), square
         hits[selection[0], p], noisy[p] = True, selection[1]
-    hits[hits.mean(axis=1) > MOST_HITS] = False
+    # With more of them the frame itself moved, or belongs to nothing.
+    hits[hits.mean(axis=1) > MOST_SPOILT] = False
     return hits, noisy
 
 
 def _noisier_than_around(noisy: Array, free: int) -> NDArray[np.bool_]:
     """Pixels (rows, columns) with far more noise than those around them, and than the image."""
     around = ndimage.percentile_filter(noisy, 100 * (1 - ALSO_BAD), size=SIDE_AROUND)
-    least = max(BAD_PIXEL, 1 + BAD_DEVIATIONS * float(np.sqrt(2 / free)))
+    least = max(BAD_PIXEL, 1 + HIT * float(np.sqrt(2 / free)))
     return np.asarray(noisy > least * np.maximum(around, np.median(noisy)))
 
 

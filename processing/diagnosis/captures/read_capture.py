@@ -17,7 +17,7 @@ from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.captures.dark_noise import without_noise_of_darks
 from processing.diagnosis.captures.rounding import Planes, Rounding
 from processing.diagnosis.captures.unstated_noise import estimated_noise
-from processing.diagnosis.search.rules import FEWEST_PIXELS, LIMIT, LITTLE, NOISE_SURE, OUTSTANDING
+from processing.diagnosis.search.rules import FEWEST_PIXELS, LIMIT, LITTLE, MOST_SPOILT, NOISE_SURE, OUTSTANDING
 from processing.instrument.changes import Conditions, elapsed, elapsed_error
 from processing.instrument.model import InstrumentModel
 from processing.reduction.capture_evidence import evidence_of
@@ -30,8 +30,6 @@ from processing.storage.captures.frame_layout import Cells
 
 #: [pixels] Around dark ones that are left out too: image derivatives over 7 pixels do not tell there what a shift does.
 DARK_RIM = 4
-#: [of its pixels] That are cut off, from which on a state is left out.
-MOST_CUT_OFF = 0.01
 #: [intensities] Of a capture that are read; a larger one is averaged over squares of pixels.
 MOST_READ = 20_000_000
 #: [intensities of a pixel] Beyond which few pixels are kept: second moments of the states would be larger than those.
@@ -158,7 +156,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     correction = CountCorrection.of(capture)
     frames = read_frames(capture, capture.adapt(model), states, correction)
     raw, side = frames.counts, frames.side
-    cut_off = frames.zero_share > MOST_CUT_OFF
+    cut_off = frames.zero_share > MOST_SPOILT
     if cut_off.all():
         raise CaptureError(f"{capture.path}: the counts of every state are cut off at zero. Raise the black level.")
     names = tuple(c.name for c in model.channels)

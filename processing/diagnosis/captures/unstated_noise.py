@@ -7,10 +7,8 @@ from scipy.optimize import nnls
 
 from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData
-from processing.diagnosis.search.rules import ENOUGH_PX, LEAST_PART, SMALL
+from processing.diagnosis.search.rules import ENOUGH_PX, FEWEST_FREE, LEAST_PART, SMALL
 
-#: [intensities of a pixel] Up to which every row tells noise that has any: there are no others.
-FEW_ROWS = 4
 #: [digits] Of the range of the signal, to which two signals are the same.
 DIGITS = 9
 #: [levels] Of the signal at which their scatter is told.
@@ -60,7 +58,8 @@ def _line_of_scatter(y: Array, of_row: Array, of_pixel: Array, keep: int) -> tup
     # What is left of one row has noise of the others. Rows and pixels that the components follow closely have less.
     of_noise = outside**2
     share = of_noise.sum(axis=1, keepdims=True)
-    good = (share > (SMALL if len(y) > FEW_ROWS else 0.0))[:, 0]
+    # Of few rows every one that has any noise tells it: there are no others.
+    good = (share > (SMALL if len(y) > FEWEST_FREE else 0.0))[:, 0]
     square = residual[good] ** 2 / share[good] / np.maximum(1 - along.sum(axis=0), SMALL)
     signal = ((of_noise / share) @ np.maximum(y - residual, 0))[good]
     # Signals that rounding alone sets apart share a level, or it would hang on the processor's order of sums.

@@ -27,7 +27,7 @@ from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.names import Names
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis
-from processing.diagnosis.search.rules import FAR_OFF, LIKELY, OUTSTANDING, SHARES
+from processing.diagnosis.search.rules import FAR_OFF, LIKELY, OUTSTANDING, SURE
 from processing.diagnosis.verdict.answer import Answer, checks, effects_of_switches, unobservable
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture, CaptureError
@@ -82,7 +82,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     wiring, bench = _rewire(problem, say, declared)
     problem, posterior = bench.problem, bench.run()
     say("testing what is left over")
-    validation, unfit = validation_problem(problem), bench.as_many_as_intensities(posterior, SHARES)
+    validation, unfit = validation_problem(problem), bench.as_many_as_intensities(posterior, 1 - SURE)
     solved = solution(validation, posterior, bench.base, bench.base.vector(bench.start), unfit=unfit)
     captures = range(len(validation.captures))
     before, after = (tuple(compute_residual(validation, k, *end) for k in captures) for end in solved.ends)

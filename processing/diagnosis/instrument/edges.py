@@ -18,11 +18,8 @@ from processing.diagnosis.instrument.pixel_sums import Pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.range_of import range_of
-from processing.diagnosis.search.rules import LIMIT
+from processing.diagnosis.search.rules import FEWEST_PIXELS, LIMIT
 from processing.diagnosis.search.space import Space
-
-#: [pixels] At edges, from which on they are asked.
-FEWEST_AT_EDGES = 10
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ def _of_capture(
     if data.steep is None:
         return None
     edge = data.steep & inside(*data.steep.shape) & ~data.clipped
-    if edge.sum() < FEWEST_AT_EDGES:
+    if edge.sum() < FEWEST_PIXELS:
         return None
     acting = [[c for c in group if c.acts(k, data.wavelength_nm)] for group in shifts]
     without = _values_without(space, values, [c for group in acting for c in group])

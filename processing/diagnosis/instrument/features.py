@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.computing.filters import separable
 from processing.diagnosis.captures.capture_data import SharedNoise
+from processing.diagnosis.search.rules import KEPT
 from processing.instrument.changes import STRAIGHT_BELOW
 from processing.reduction.move_image import noise_taps
 
@@ -34,8 +35,6 @@ ORDERS = ((0, 1), (1, 0), (0, 2), (1, 1), (2, 0))
 DERIVATIVES = len(ORDERS)
 #: Filters down and across the image of a pixel itself and of its derivatives.
 PATTERNS = ((np.eye(2 * MARGIN + 1)[MARGIN],) * 2, *((FILTERS[down], FILTERS[across]) for down, across in ORDERS))
-#: [answers] That are kept of what frames have of their noise in common.
-KEPT = 1024
 
 
 def features(u: NDArray[np.floating[Any]], x: Array, y: Array) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -20,7 +20,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.posterior import Say
 from processing.diagnosis.search.range_of import NEARLY_ZERO
-from processing.diagnosis.search.rules import ALIKE, FAR_OFF
+from processing.diagnosis.search.rules import FAR_OFF, LITTLE
 from processing.diagnosis.search.space import Space
 from processing.instrument.elements import number
 
@@ -62,7 +62,7 @@ def nearest_branch(problem: InstrumentProblem, estimates: Mapping[Candidate, Arr
     for count in range(1, len(places) + 1):
         for turned in combinations(places, count):
             mirrored = _turn_quarter(problem, values, turned)
-            if _excess(problem, mirrored) <= excess * (1 + ALIKE):
+            if _excess(problem, mirrored) <= excess * (1 + LITTLE):
                 branches.append((turned, mirrored))
     branches.sort(key=lambda branch: _distance(branch[1], places))
     (turned, best), *rivals = branches

@@ -21,6 +21,7 @@ from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.captures.read_capture import FEW_PIXELS
 from processing.diagnosis.instrument.features import FEATURES
 from processing.diagnosis.instrument.pixel_sums import Pixels, Precision, features_of_pixels, products_of_pixels
+from processing.diagnosis.search.range_of import RANK
 from processing.diagnosis.search.rules import FOLDS_OF_TILES, TILES
 from processing.instrument.changes import places
 
@@ -32,9 +33,6 @@ FOLDS_OF_STATES = 5
 MOST_TILES = 16
 #: [pixels] Along a side of a tile, between these two.
 TILE_PX = 4
-
-#: [of the largest] Eigenvalues of second moments below this are none.
-LEAST_MOMENT = 1e-15
 
 
 @dataclass(frozen=True)
@@ -262,5 +260,5 @@ def _blocks_of(
 
 def _square_root(s: Array) -> Array:
     value, vector = np.linalg.eigh(s)
-    keep = value > LEAST_MOMENT * value[-1]
+    keep = value > RANK**2 * value[-1]
     return np.asarray(vector[:, keep] * np.sqrt(value[keep]))

@@ -20,7 +20,7 @@ from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.range_of import RANK
 from processing.diagnosis.search.result import Check, MuellerError
-from processing.diagnosis.search.rules import CHANCE_WORSE, TAKES_PART
+from processing.diagnosis.search.rules import CHANCE_WORSE, SMALL, TAKES_PART
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import Changes
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
@@ -29,8 +29,6 @@ from processing.instrument.model import AppliedEffect, EffectParameter, Systemat
 STORED_SHARE = 0.995
 #: [directions] That are stored at most.
 MOST_STORED = 20
-#: [of the largest effect in a direction] Below which another one in it is left out.
-SMALL_PART = 0.03
 
 
 def mueller_slopes(
@@ -229,7 +227,7 @@ def _moves_m(posterior: Posterior, k: int, applied: bool) -> bool:
 def _effects_of(space: Space, direction: Array, size: Array, names: tuple[str, ...]) -> tuple[AppliedEffect, ...]:
     effects = []
     for candidate, part in space.pairs:
-        if size[part].max() <= SMALL_PART * size.max():
+        if size[part].max() <= SMALL * size.max():
             continue
         step, captures = direction[part], names if candidate.capture is None else (names[candidate.capture],)
         for single, values, _ in candidate.by_wavelength(step, np.zeros((step.size, step.size))):

@@ -27,7 +27,7 @@ from processing.diagnosis.instrument.slopes import Columns, slopes_of_counts, sl
 from processing.diagnosis.instrument.tiles import add_tiles, slopes_of_tiles, tile_columns
 from processing.diagnosis.search.candidate import Candidate, SourceLevel, nominal_values, pool
 from processing.diagnosis.search.range_of import range_of
-from processing.diagnosis.search.rules import EXACT
+from processing.diagnosis.search.rules import EXACT, KEPT
 from processing.diagnosis.search.space import Space, Sums
 from processing.instrument.applied_effects import changes_of
 from processing.instrument.changes import Changes
@@ -38,10 +38,6 @@ ENOUGH_SOUND = 1.5
 
 #: [points] Of expansion that are kept besides the first: each has counts of its own.
 MOST_POINTS = 3
-#: [matrices] Of elements that are kept for use in another evaluation.
-MOST_BUILT = 64
-#: [changes] Of single candidates that are kept: a step of each is asked again and again.
-MOST_ASKED = 4096
 
 
 class InstrumentProblem:
@@ -221,7 +217,7 @@ class InstrumentProblem:
         """Changes of one capture with the instrument's own effects and the active candidates."""
         data = self.captures[capture]
         built = self._built[capture]
-        if len(built) > MOST_BUILT:
+        if len(built) > KEPT:
             built.clear()
         changes = Changes(data.conditions, built=built)
         changes.add(self._changes_of(capture, None, np.zeros(0)))
@@ -237,7 +233,7 @@ class InstrumentProblem:
         name = (candidate.kind, candidate.place) if candidate else ("", "")
         key = (*name, values.tobytes())
         if key not in cache:
-            if len(cache) > MOST_ASKED:
+            if len(cache) > KEPT:
                 cache.clear()
             changes = Changes(data.conditions) if candidate else changes_of(model, data.conditions, data.name)
             if candidate:

@@ -16,7 +16,7 @@ from scipy.special import expit
 from processing.arrays import Array
 from processing.diagnosis.search.likely_set import PATIENCE, climb
 from processing.diagnosis.search.range_of import NEARLY_ZERO
-from processing.diagnosis.search.rules import ALTERNATIVE, SHARES
+from processing.diagnosis.search.rules import ALTERNATIVE, SURE
 from processing.diagnosis.search.sets import Conditional, SetFit, Sets, State
 
 
@@ -177,6 +177,6 @@ def likely_starts(sets: Sets, state: State) -> list[tuple[State, float]]:
     score = np.array([sets.score(sets.settled(s)) for s in states])
     share = np.exp(score - score.max())
     share /= share.sum()
-    starts = [(s, float(w)) for s, w in zip(states, share, strict=True) if w > SHARES]
+    starts = [(s, float(w)) for s, w in zip(states, share, strict=True) if w > 1 - SURE]
     total = sum(w for _, w in starts)
     return [(s, w / total) for s, w in starts]

@@ -16,7 +16,7 @@ from scipy.special import expit
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import ALIKE, LIKELY, NOMINAL_TAU, OUTSTANDING, SHOWN, SURE
+from processing.diagnosis.search.rules import LIKELY, LITTLE, NOMINAL_TAU, OUTSTANDING, SHOWN, SURE
 from processing.diagnosis.search.space import Problem
 
 #: [log odds] By which one of two causes has to be likelier for a sure name.
@@ -107,7 +107,7 @@ def forgiven_misfit(fit_gain: Array, k: int, chi2: float) -> Array:
     A model that is not exact fits a little worse than it should. That does not excuse a model with more values: its
     prior counts in full. `chi2` is that which no cause explains, in its unit.
     """
-    allowed = max(ALIKE * fit_gain[k], 0.5 * chi2)
+    allowed = max(LITTLE * fit_gain[k], 0.5 * chi2)
     return np.asarray(np.clip(fit_gain[k] - fit_gain, 0.0, allowed))
 
 

@@ -9,7 +9,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import Fit, Solution, held_out, minimize
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import LIKELY, LITTLE, SEEN, SHARES, TAKES_PART
+from processing.diagnosis.search.rules import LIKELY, LITTLE, SLACK, SURE, TAKES_PART
 from processing.diagnosis.search.space import Problem, Space
 
 
@@ -20,7 +20,7 @@ def applied(posterior: Posterior, base: Space, unfit: Collection[Candidate] = ()
     for cause in causes(posterior, 0.0):
         # That one of a class is there can be certain while none of it is likely by itself: each gets its share.
         if cause.probability >= LIKELY:
-            shares = [by_label[c] for c in cause.alternatives if posterior.samples.probability[by_label[c]] > SHARES]
+            shares = [by_label[c] for c in cause.alternatives if posterior.samples.probability[by_label[c]] > 1 - SURE]
             keep.update(cause.candidates, (posterior.space.candidates[m] for g in shares for m in posterior.members[g]))
     for g in _least_needed(posterior, keep):
         keep |= {posterior.space.candidates[m] for m in posterior.members[g]}
@@ -44,7 +44,7 @@ def _least_needed(posterior: Posterior, keep: Collection[Candidate]) -> list[int
     groups: list[int] = []
     for g in order:
         loss = form.at(np.where(is_used, mean, 0.0)) - chi2_at_mean
-        if posterior.samples.probability[g] <= TAKES_PART and loss <= SEEN * posterior.samples.best.unit:
+        if posterior.samples.probability[g] <= TAKES_PART and loss <= SLACK**2 * posterior.samples.best.unit:
             break
         groups.append(int(g))
         for m in posterior.members[g]:

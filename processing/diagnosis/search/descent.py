@@ -11,12 +11,9 @@ from processing.arrays import Array
 from processing.diagnosis.search.averages import Samples, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import minimize
-from processing.diagnosis.search.rules import CHANGES_BEFORE, EXACT, LITTLE, NOMINAL_TAU, TAKES_PART
+from processing.diagnosis.search.rules import CHANGES_BEFORE, EXACT, LITTLE, NOMINAL_TAU, ROUNDS, TAKES_PART
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Problem, Space
-
-#: [times] That everything is linearized anew before groups are chosen.
-EXPANSIONS = 8
 
 
 def all_at_once(
@@ -29,7 +26,7 @@ def all_at_once(
     always = np.concatenate([np.full(c.size, c in fixed) for c in part.candidates])
     width = part.joined("typical") * np.where(always, NOMINAL_TAU, tau)
     values = x[positions]
-    for _ in range(EXPANSIONS):
+    for _ in range(ROUNDS):
         sums = problem.sums(part, values, derivatives=False)
         weak = noise.unit(sums.chi2(problem.noise_known)) / width**2
         new = minimize(problem, part, values, steps=3, expansions=0, weak=weak).values

@@ -10,25 +10,16 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array, BoolArray
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.rules import LITTLE, NOMINAL_TAU
+from processing.diagnosis.search.range_of import NEARLY_ZERO, RANK
+from processing.diagnosis.search.rules import LITTLE, NOMINAL_TAU, ROUNDS
 from processing.diagnosis.search.space import Problem, Space, Sums
 
 #: [of the degrees of freedom] That fitted values leave at least, where nothing is held out.
 LEAST_FREEDOM = 0.2
 #: [steps] Of a fit.
 STEPS = 15
-#: [times] That corrections of counts are expanded anew in one fit.
-EXPANSIONS = 2
 #: [chi-square] The fit ends when a step gains less than this.
 LEAST_GAIN = 0.05
-#: [of the chi-square] The same.
-LEAST_RELATIVE = 1e-7
-#: [of the excess] Precision of held-out predictions: a fit that ends earlier would still contain the held-out data.
-HELD_OUT_RELATIVE = 1e-4
-#: [1] By which a step that is refused is damped more, and one that is taken less.
-STIFFER = 10.0
-#: [of the curvature] Damping beyond which there is no step.
-MOST_DAMPING = 1e6
 
 
 @dataclass(frozen=True)
@@ -58,7 +49,7 @@ def minimize(
     *,
     free: NDArray[np.bool_] | None = None,
     steps: int = STEPS,
-    expansions: int = EXPANSIONS,
+    expansions: int = ROUNDS,
     least_gain: float = LEAST_GAIN,
     weak: Array | None = None,
 ) -> Fit:
@@ -109,20 +100,20 @@ def _descend(
         while True:
             step = np.zeros_like(x)
             step[move] = -np.linalg.solve(hm + damping * np.diag(np.diag(hm)), gm)
-            if not damping and -gm @ step[move] < least_gain + LEAST_RELATIVE * abs(cost):
+            if not damping and -gm @ step[move] < least_gain + RANK * abs(cost):
                 return Fit(x, sums, float(sums.excess[use].sum()))
             tried = np.clip(x + step, lower, upper)
             # Derivatives are most of the work; a step that is refused needs none.
             now = _penalize(problem.sums(space, tried, derivatives=False), weak, tried, use, reference=reference)
-            if now <= cost or damping > MOST_DAMPING:
+            if now <= cost or damping > 1 / NEARLY_ZERO:
                 break
-            damping = max(damping * STIFFER, LITTLE)
+            damping = max(10 * damping, LITTLE)
         # Also where the sum is no number: so far away that the model has no intensities.
         if not now <= cost:
             break
         gain, x, cost, sums = cost - now, tried, now, problem.sums(space, tried)
-        damping = damping / STIFFER if damping > LITTLE else 0.0
-        if gain < least_gain + LEAST_RELATIVE * abs(cost):
+        damping = damping / 10 if damping > LITTLE else 0.0
+        if gain < least_gain + RANK * abs(cost):
             break
     return Fit(x, sums, float(sums.excess[use].sum()))
 
@@ -202,8 +193,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
     spent = np.zeros(space.size)
     for fold in range(problem.folds):
         training_folds = [f for f in range(problem.folds) if f != fold]
-        least = max(LEAST_GAIN, HELD_OUT_RELATIVE * abs(full.excess))
-        values = minimize(problem, space, full.values, training_folds, least_gain=least, weak=weak).values
+        values = minimize(problem, space, full.values, training_folds, weak=weak).values
         if local.any():
             start = np.where(local, full.values, values)
             fit = minimize(problem, space, start, [fold], free=local, steps=3)

@@ -8,10 +8,9 @@ from processing.arrays import BoolArray
 from processing.diagnosis.search.rules import ALTERNATIVE, NEEDED
 from processing.diagnosis.search.sets import NEVER, Sets, State
 
-#: [changes] That are tried one after the other without a gain before a climb ends, and instead of one group.
+#: [changes] That are tried one after the other without a gain before a climb ends, and instead of one group; one in so
+#: many of the groups without evidence is removed at once.
 PATIENCE = 8
-#: [1] One in so many of the groups without evidence is removed at once.
-AT_ONCE = 6
 
 
 def likely_set(sets: Sets, initial: BoolArray | None = None) -> State:
@@ -69,7 +68,7 @@ def thin_out(sets: Sets) -> State:
         if odds.min(initial=np.inf) > NEEDED:
             return best_state
         # Of those that may be there alone one after the other: the last is not impossible any more.
-        at_once = 1 if odds.min() < NEVER / 2 else max(1, int(np.sum(odds < 0)) // AT_ONCE)
+        at_once = 1 if odds.min() < NEVER / 2 else max(1, int(np.sum(odds < 0)) // PATIENCE)
         worst = np.argsort(odds)[:at_once]
         state.tau[worst] = 0.0
         retune(sets, state)

@@ -24,18 +24,19 @@ NOMINAL_TAU = 10.0
 NOMINAL_DEG = 30.0
 #: [degree] The same of the retardance of what has none: a window is close to that.
 WINDOW_DEG = 1.0
-#: [1] The same of an extinction: what is only nominal may be a film.
-NOMINAL_EXTINCTION = 0.1
-#: [1] The same of a diattenuation, or of a depolarization.
+#: [1] The same of an extinction, as what is only nominal may be a film, and of the gain of a channel: coatings and two
+#: cameras differ by this much.
+NOMINAL_PART = 0.1
+#: [1] The same of a diattenuation, of a depolarization, and of the change of a level from state to state. As far below
+#: zero may noise take an extinction or a depolarization.
 NOMINAL_SHARE = 0.01
-#: [1] The same of the gain of a channel: coatings and two cameras differ by this much.
-NOMINAL_GAIN = 0.1
 #: [of a factor e in wavelength] Length over which values of optics stay alike from one wavelength to another: an
 #: achromatic plate bends once over an octave, a coating a few times.
 SMOOTH = 0.3
 
 # ---- noise ---------------------------------------------------------------------------------------------------------
-#: [standard deviations] Total excess over the noise's own chi-square up to which it is no structure.
+#: [standard deviations] Total excess over the noise's own chi-square up to which it is no structure; of information
+#: about a typical size below which an effect cannot be seen, and what the fit may lose by groups that take no part.
 SLACK = 2.0
 #: [of its variance] Standard error of the noise itself: no gain is known better than to half a percent. Of two million
 #: intensities that is five times what chance does to their sum of squares.
@@ -52,6 +53,10 @@ FEWEST_OF_MANY = 100
 ENOUGH_PX = 50_000
 #: [of the residual] That a bad frame, a far start or a round of a search has to take away.
 MOSTLY = 0.5
+#: [of its pixels] That are cut off, or struck, in a state: beyond, the state itself is no measurement.
+MOST_SPOILT = 0.01
+#: [directions] Over the states that the model leaves over, below which they tell no hits and no noise.
+FEWEST_FREE = 4
 
 # ---- the detector's noise, as its images show it ------------------------------------------------------------------
 #: [standard deviations] From which on the noise, or an effect over the image, differs from what is declared; and below
@@ -65,8 +70,8 @@ DARK_NOISE_OFF = 0.5
 #: [of the whole] Below which a part tells nothing: of the variance with or without light, of the scatter of a row, of
 #: the light in dim pixels, of the noise in image derivatives, of the noise that neighbours share.
 SMALL = 0.05
-#: [of the whole] A part that changes nothing: weak beliefs, first damping, least width of a prior and of a noise, and
-#: how close to a bound a value stands there.
+#: [of the whole] A part that changes nothing: weak beliefs, first damping, least width of a prior and of a noise,
+#: how close to a bound a value stands there, and the misfit of an effect's model, which is never exact.
 LITTLE = 1e-3
 #: [of what is usual] Least part of the variance that weights are made of.
 LEAST_PART = 0.01
@@ -93,8 +98,6 @@ EXACT = 0.3
 #: [probability] From which on a group takes part in the correction that is written. What is less likely moves the mean
 #: by less than its own error.
 TAKES_PART = 0.25
-#: [probability] From which on a member of a class that is likely as a whole takes its share in the correction.
-SHARES = 0.01
 #: [1] Growth of the residual on held-out data that is still put down to chance.
 WORSE = 1.002
 #: [probability] That the error of what the user reads grows by a correction, up to which it is written: below it the
@@ -127,8 +130,6 @@ LIKELY = 0.9
 #: [log odds] By which another group, or set, may be worse and still be tried, 1 to 1100: the unit of chi-square may
 #: fall with it.
 ALTERNATIVE = 7.0
-#: [of what the cause explains] Misfit that does not rule out another cause: no effect's model is exact.
-ALIKE = 1e-3
 #: [standard deviations] From which on a value is not zero; of several as many beyond what chance gives all of them.
 SHOWN = 3.0
 #: [causes] That are told with what each would explain alone; half of them as tried where nothing is named.
@@ -148,9 +149,6 @@ TESTABLE = 0.75
 TIMES = 100.0
 
 # ---- what captures can show ----------------------------------------------------------------------------------------
-#: [chi-square] Two standard deviations: information about a typical size below which an effect cannot be seen, and what
-#: the fit may lose by groups that take no part.
-SEEN = 4.0
 #: [standard deviations] By which something stands out that is tested once: an effect of typical size, a mistake of
 #: wiring, an autocorrelation over the states; and at which residuals and counts near the full well are cut back.
 OUTSTANDING = 4.0
@@ -162,6 +160,8 @@ APART = 0.3
 STEP = 1e-4
 #: [rounds] Times that the problem is linearized anew about its solution.
 ROUNDS = 7
+#: [answers] That are kept: a step is asked again and again, and frames that moved together share one.
+KEPT = 1024
 #: [changes] Of a chain in the last round.
 CHANGES = 300
 #: [changes] The same in the rounds before.

@@ -26,8 +26,6 @@ from processing.storage.captures.capture import Capture
 
 #: [of the median] Brightness below which a pixel of an object is shadow or background.
 DARK = 0.1
-#: [of the noise of a pixel] Modulated light of a tile from which on its pixels have a say in the dominant process.
-LEAST_MODULATION = 1.0
 #: [pixels] Of an object that are used at most, evenly spread.
 MOST_OF_OBJECT = 4000
 #: [of its radius] Rim of an object that is left out: one off its place would mix object and background there.
@@ -84,7 +82,7 @@ class SurfaceData:
         e /= np.linalg.norm(e, axis=1, keepdims=True)
         modulation = np.sum(y**2, axis=1) - np.sum(e * y, axis=1) ** 2 - (y.shape[1] - 1)
         pixels = np.maximum(np.bincount(self.tile), 1)
-        return np.asarray((np.bincount(self.tile, modulation) / pixels > LEAST_MODULATION)[self.tile])
+        return np.asarray((np.bincount(self.tile, modulation) / pixels > 1)[self.tile])
 
 
 def read_surface(

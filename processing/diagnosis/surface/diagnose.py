@@ -18,7 +18,7 @@ from processing.diagnosis.search.names import AT_BOUND, Names, at_bound, with_pa
 from processing.diagnosis.search.posterior import Posterior, Say, fit_posterior
 from processing.diagnosis.search.range_of import least_apart, rank_of
 from processing.diagnosis.search.result import CaptureReport, Correction, Diagnosis
-from processing.diagnosis.search.rules import APART, LIKELY, LIMIT, SHOWN
+from processing.diagnosis.search.rules import APART, GROWTH, LIKELY, LIMIT, SHOWN
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.data import SurfaceData, read_surface
 from processing.diagnosis.surface.problem import OF_INSTRUMENT, SurfaceProblem, structure
@@ -34,8 +34,6 @@ from processing.storage.captures.capture import Capture, CaptureError
 AS_LIKELY = 0.015
 #: [1] Times that an error may grow at most as a bent valley asks.
 MOST_WIDER = 8.0
-#: [1] How close to its end such a search comes.
-CLOSE = 1.05
 CONFIRM = (
     " Confirm with a full Mueller capture: linear Stokes cannot test that the three other processes are equal, and so "
     "small a residual may come from that alone."
@@ -125,7 +123,7 @@ def widen_errors(problem: SurfaceProblem, posterior: Posterior, solved: Solution
 
     for j in np.flatnonzero(size > 0):
         step = SHOWN * np.sqrt(size[j]) * axes[:, j] * typical
-        while wide[j] < MOST_WIDER and (missing := SHOWN / np.sqrt(rise(wide[j] * step))) > CLOSE:
+        while wide[j] < MOST_WIDER and (missing := SHOWN / np.sqrt(rise(wide[j] * step))) > GROWTH:
             wide[j] = min(wide[j] * min(missing, 2.0), MOST_WIDER)
     covariance = posterior.covariance.copy()
     covariance[np.ix_(index, index)] = (axes * size * wide**2) @ axes.T * np.outer(typical, typical)

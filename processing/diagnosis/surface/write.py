@@ -5,12 +5,13 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from processing.diagnosis.instrument_file import SAME_NM, WriteError, file_head
+from processing.diagnosis.instrument_file import WriteError, file_head
 from processing.diagnosis.surface.diagnose import SurfaceDiagnosis
 from processing.doors import require_new
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.model import InstrumentModel
+from processing.reduction.flat import SAME_NM
 from processing.reflectance import first_surface, polarized_diffuse
 from processing.reflectance.effects.base import reflectance_effects
 from processing.whole_file import write_new_text

@@ -26,7 +26,7 @@ from processing.diagnosis.search.result import (
     Ranked,
     Unexplained,
 )
-from processing.diagnosis.search.rules import MOST_RANKED, NEEDED, SEEN, SMALL
+from processing.diagnosis.search.rules import MOST_RANKED, NEEDED, SLACK, SMALL
 from processing.diagnosis.search.space import Problem, Space
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
 
@@ -201,7 +201,7 @@ def unobservable(problem: Problem, posterior: Posterior) -> list[Candidate]:
     for candidate, part in posterior.space.pairs:
         if candidate.state_chosen or candidate.effect.is_switch or np.isin(part.start, always):
             continue
-        least = np.full(candidate.size, SEEN)
+        least = np.full(candidate.size, SLACK**2)
         if candidate.reaches_around:
             # Noise alone has slopes too, from one pixel to the next, which a shift would change.
             alone = Space((candidate,))
