@@ -7,7 +7,7 @@ import pytest
 
 from processing.diagnosis.instrument.mueller_error import chances, lasts
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.decision import Judgement, PredictedChange, predicted_change, rows_checks
+from processing.diagnosis.search.decision import Judgement, PredictedChange, predicted_change
 from processing.diagnosis.search.fit import Fit, HeldOut, Solution
 from processing.diagnosis.search.result import Check
 from processing.diagnosis.search.space import Space, Sums
@@ -130,27 +130,3 @@ def test_what_a_correction_does_to_each_of_several_captures_is_told_and_does_not
     assert flat_check.name == "predicted error of M/m00 of flat (flat.h5), rms (it grows with a chance of 0.31)"
     assert (flat_check.before, flat_check.after) == (flat.before, flat.after)
     assert flat_check.holds
-
-
-def test_a_direction_that_was_not_seen_before_makes_no_condition_worse():
-    """Light that is a little circular raises the rank of W; what was seen before is seen as well as then."""
-    before = np.diag([*np.ones(12), *np.zeros(4)])
-    seen = before + np.diag([*np.zeros(12), *np.full(4, 1e-3)])
-    worse = before - np.diag([*np.zeros(11), 0.9, *np.zeros(4)])
-    assert [check.holds for check in rows_checks([("air", before, seen)])] == [True, True]
-    assert [check.holds for check in rows_checks([("air", before, worse)])] == [True, False]
-    assert [check.holds for check in rows_checks([("air", seen, before)])] == [False, False]
-
-
-def test_the_matrix_of_one_wavelength_of_three_may_lose_a_direction():
-    """The plates of a telescope's polarimeter leave 15 directions near 1329 nm; all its wavelengths were refused."""
-    whole = np.diag([*np.ones(15), 1e-3])
-    poor = np.diag([*np.ones(15), 1e-7])
-    figures = rows_checks([("1283 nm", whole, whole), ("1329 nm", whole, poor), ("1380 nm", whole, whole)])
-    assert all(check.holds for check in figures)
-    assert (figures[2].before, figures[2].after) == (16, 15)
-    figures = rows_checks([("1283 nm", whole, poor), ("1329 nm", whole, poor), ("1380 nm", whole, whole)])
-    assert [check.name for check in figures if not check.holds] == [
-        "rank of the measurement matrix of the captures, median",
-        "condition of the measurement matrix of the captures, median",
-    ]

@@ -10,18 +10,16 @@ from processing.diagnosis.instrument.edges import at_edges
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.unevenness import Evenness
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import LEAST_DIFFERENCE, Cause, significance
+from processing.diagnosis.search.causes import Cause, significance
 from processing.diagnosis.search.fit import Solution
-from processing.diagnosis.search.names import AT_BOUND, at_bound, with_parts
+from processing.diagnosis.search.names import with_parts
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import EDGES, LIMIT, OUTSTANDING, TESTABLE, UNEVEN_SHARE
+from processing.diagnosis.search.rules import EDGES, LIMIT, OUTSTANDING, TESTABLE
 
 #: The image does not move where that would be seen best.
 STANDS = "the edges, which were left out of the fit, do not move as it says"
 #: Optics, mechanics and detector are the same for the whole image.
 NOT_ALIKE = "it differs from part to part of the image, which this effect does not"
-#: Reasons that say that something else is there, of which what the cause explains is left over.
-ELSE = (STANDS, NOT_ALIKE)
 #: The sample of a capture, or its light, changed: what that capture alone says of the instrument may be a part of that.
 OF_THE_SAMPLE = "it differs from part to part of the image, which a source does not"
 
@@ -37,22 +35,17 @@ def doubts(
         reason = STANDS if cause in static else _doubt_of(problem, solved, cause, even=even)
         if reason is not None:
             reasons[cause] = reason
-    # What is something else took away a part of what is left over.
-    another = [c.log_odds for c, why in reasons.items() if why in ELSE and c.log_odds > LEAST_DIFFERENCE]
-    chi2 += 2 * posterior.samples.best.unit * sum(another)
     return with_parts(posterior, causes, reasons, chi2=chi2, noise_known=problem.noise_known)
 
 
 def _doubt_of(problem: InstrumentProblem, solved: Solution, cause: Cause, *, even: Evenness) -> str | None:
     """The reason that a cause gives by itself, whatever is left of the others."""
     effect = cause.candidates[0].effect
-    if at_bound(cause):
-        return AT_BOUND
     # Channels that look at places apart leave something where the image is curved: that is not alike either.
     apart = any(c.place_px is not None for c in problem.captures)
     if effect.per_state or (apart and not effect.of_source):
         return None
-    uneven = any(_uneven(even, solved, c, cause) for c in cause.candidates)
+    uneven = any(_uneven(even, solved, c) for c in cause.candidates)
     return (OF_THE_SAMPLE if effect.of_source else NOT_ALIKE) if uneven else None
 
 
@@ -60,7 +53,7 @@ def find_changed(problem: InstrumentProblem, solved: Solution, doubt: Mapping[Ca
     """Captures whose sample or light changed, by the doubts of causes."""
     even = Evenness(problem, solved.space, solved.fit.values)
     causes = [cause for cause, why in doubt.items() if why == OF_THE_SAMPLE]
-    uneven = [c for cause in causes for c in cause.candidates if _uneven(even, solved, c, cause)]
+    uneven = [c for cause in causes for c in cause.candidates if _uneven(even, solved, c)]
     return {k for c in uneven for k, nm in enumerate(problem.wavelengths_nm) if c.acts(k, nm)}
 
 
@@ -102,9 +95,9 @@ def testable(problem: InstrumentProblem, solved: Solution, cause: Cause, causes:
     )
 
 
-def _uneven(even: Evenness, solved: Solution, candidate: Candidate, cause: Cause) -> bool:
+def _uneven(even: Evenness, solved: Solution, candidate: Candidate) -> bool:
     """A source, a train or a detector that changes does so alike in the whole image."""
     if candidate not in solved.space.candidates or any(c.effect.varies_over_image for c in solved.effects):
         return False
     excess, terms = even.varies(candidate)
-    return bool(excess > max(OUTSTANDING * np.sqrt(2 * terms), UNEVEN_SHARE * 2 * cause.log_odds))
+    return bool(excess > OUTSTANDING * np.sqrt(2 * terms))

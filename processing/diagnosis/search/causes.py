@@ -16,7 +16,7 @@ from scipy.special import expit
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import LIKELY, LITTLE, NOMINAL_TAU, OUTSTANDING, SHOWN, SURE
+from processing.diagnosis.search.rules import LIKELY, NOMINAL_TAU, OUTSTANDING, SHOWN, SURE
 from processing.diagnosis.search.space import Problem
 
 #: [log odds] By which one of two causes has to be likelier for a sure name.
@@ -104,11 +104,10 @@ def significance(values: Array, covariance: Array) -> float:
 def forgiven_misfit(fit_gain: Array, k: int, chi2: float) -> Array:
     """Part of its misfit that is no evidence against each group (G,) as the replacement of group k, in log odds.
 
-    A model that is not exact fits a little worse than it should. That does not excuse a model with more values: its
-    prior counts in full. `chi2` is that which no cause explains, in its unit.
+    What is left over excuses a fit that is worse by as much, and no model with more values: its prior counts in full.
+    `chi2` is that which no cause explains, in its unit.
     """
-    allowed = max(LITTLE * fit_gain[k], 0.5 * chi2)
-    return np.asarray(np.clip(fit_gain[k] - fit_gain, 0.0, allowed))
+    return np.asarray(np.clip(fit_gain[k] - fit_gain, 0.0, 0.5 * chi2))
 
 
 def information(posterior: Posterior) -> tuple[Array, NDArray[np.int64]]:

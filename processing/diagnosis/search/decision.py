@@ -5,7 +5,7 @@ No correction is written that makes a measurement worse: figures before and afte
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +13,8 @@ from scipy.special import ndtr
 
 from processing.arrays import Array
 from processing.diagnosis.search.fit import Solution
-from processing.diagnosis.search.range_of import NEARLY_ZERO
 from processing.diagnosis.search.result import Check, Error, Verdict
-from processing.diagnosis.search.rules import CHANCE_WORSE, LEAST_CHANGE, LIMIT, LIMIT_OF_TWO, WORSE, WORSE_CONDITION
+from processing.diagnosis.search.rules import CHANCE_WORSE, LEAST_CHANGE, LIMIT, WORSE
 
 
 def held_out_check(before: Error, after: Error) -> Check:
@@ -25,35 +24,6 @@ def held_out_check(before: Error, after: Error) -> Check:
         before=before.rms_percent,
         after=after.rms_percent,
         holds=bool(after.rms_percent <= WORSE * before.rms_percent),
-    )
-
-
-def rows_checks(captures: Sequence[tuple[str, Array, Array]]) -> tuple[Check, ...]:
-    """Rank and condition of the measurement matrix W (L, 16) of each capture, by name, without and with a correction.
-
-    The median over several captures decides. Near one wavelength the true W of an instrument may have no full rank.
-    """
-    figures: list[Check] = []
-    for name, *matrices in captures:
-        sizes = [np.linalg.svd(w, compute_uv=False) for w in matrices]
-        rank, new_rank = (int(np.sum(size > NEARLY_ZERO * size[0])) for size in sizes)
-        # A direction that the correction adds may be seen poorly: it was not seen at all before.
-        condition, new_condition = (float(size[0] / max(size[rank - 1], 1e-300)) for size in sizes)
-        figures += _rows_pair(name, (rank, new_rank), (condition, new_condition))
-    if len(captures) == 1:
-        return tuple(figures)
-    ranks, conditions = (np.median([(c.before, c.after) for c in figures[k::2]], axis=0).tolist() for k in (0, 1))
-    decisive = _rows_pair("the captures, median", ranks, conditions)
-    return *(c.model_copy(update={"holds": True}) for c in figures), *decisive
-
-
-def _rows_pair(name: str, ranks: Sequence[float], conditions: Sequence[float]) -> tuple[Check, Check]:
-    where = f"of the measurement matrix of {name}"
-    (rank, new_rank), (condition, new_condition) = ranks, conditions
-    holds = bool(new_condition <= WORSE_CONDITION * condition)
-    return (
-        Check(name=f"rank {where}", before=rank, after=new_rank, holds=bool(new_rank >= rank)),
-        Check(name=f"condition {where}", before=condition, after=new_condition, holds=holds),
     )
 
 
@@ -137,7 +107,7 @@ class Judgement:
     named, sure : whether a cause is present, and whether the name of one is without doubt.
     structure : whether tests find structure in the residual.
     observable : whether a fault of typical size would have been seen.
-    figures : of the residual and of W, before and after; chances : that what the user reads gets worse.
+    figures : of the residual, before and after; chances : that what the user reads gets worse.
     first : what has to be changed before anything else means something.
     """
 
@@ -151,7 +121,7 @@ class Judgement:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict from names and structure; a correction that increases the residual or spoils W explains nothing."""
+        """Verdict from names and structure; a correction that increases the residual explains nothing."""
         if self.first is not None or (self.named and refusal(self.figures) is not None):
             return "unexplained"
         if self.structure:
@@ -177,10 +147,8 @@ class Judgement:
 
 
 def beyond_chance(tests: Mapping[str, float]) -> dict[str, float]:
-    """The tests of a capture that are beyond chance, one by itself or two together; the largest first."""
-    in_order = sorted(tests.items(), key=lambda item: -item[1])
-    two = dict(item for item in in_order if item[1] > LIMIT_OF_TWO)
-    return two if len(two) > 1 else dict(item for item in in_order if item[1] > LIMIT)
+    """The tests of a capture that are beyond chance; the largest first."""
+    return dict(sorted(((name, value) for name, value in tests.items() if value > LIMIT), key=lambda item: -item[1]))
 
 
 def in_words(tests: Mapping[str, float]) -> list[str]:

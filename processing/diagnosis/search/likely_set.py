@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from processing.arrays import BoolArray
 from processing.diagnosis.search.rules import ALTERNATIVE, NEEDED
 from processing.diagnosis.search.sets import NEVER, Sets, State
 
@@ -13,17 +12,9 @@ from processing.diagnosis.search.sets import NEVER, Sets, State
 PATIENCE = 8
 
 
-def likely_set(sets: Sets, initial: BoolArray | None = None) -> State:
-    """The likeliest of several searches: causes can be evident together and not alone, and the reverse.
-
-    One search starts from the groups `initial` (G,), in the unit of noise: in that of structure a prior is too stiff
-    for a cause that explains it.
-    """
+def likely_set(sets: Sets) -> State:
+    """The likelier of two searches: causes can be evident together and not alone, and the reverse."""
     states = [climb(sets, sets.empty()), climb(sets, thin_out(sets))]
-    if initial is not None:
-        begin = State(np.where(initial & sets.free, 1.0, sets.empty().tau), sets.noise.floor)
-        retune(sets, begin)
-        states.append(climb(sets, begin))
     return max(states, key=lambda s: sets.score(s))
 
 

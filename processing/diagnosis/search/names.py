@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Answer, Cause
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import LIKELY, LITTLE, NEEDED, SURE, TIMES
+from processing.diagnosis.search.rules import LIKELY, NEEDED, SURE, TIMES
 
-AT_BOUND = "a value stands at its bound: the data ask for something else"
 #: Reasons that leave a name likely.
 PART_OF_LEFT = "it may be a part of what is left unexplained"
 PART_OF_UNLISTED = "it may be a part of the fault that has no name"
@@ -63,15 +62,6 @@ def with_parts(
     if any(posterior.label(k).price for k in posterior.free_groups):
         reasons |= {cause: PART_OF_UNLISTED for cause in causes if cause not in reasons and cause.answer != "unlisted"}
     return reasons
-
-
-def at_bound(cause: Cause) -> bool:
-    """Whether a value of a cause stands at the end of its range."""
-    for candidate, values in zip(cause.candidates, cause.values, strict=True):
-        width = candidate.upper - candidate.lower
-        if (((values - candidate.lower) < LITTLE * width) | ((candidate.upper - values) < LITTLE * width)).any():
-            return True
-    return False
 
 
 def answer_of(cause: Cause, doubt: str | None) -> tuple[Answer, float]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processing.arrays import Array, BoolArray
+from processing.arrays import Array
 from processing.diagnosis.search.averages import Samples, likely_starts, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.descent import (
@@ -113,24 +113,20 @@ def fit_posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], st
 
 @dataclass(frozen=True, eq=False)
 class _Round:
-    """The problem linearized `about` values (K,), with the `excess` there, and a likely set in it.
-
-    `keeps` : the next round begins at this set too.
-    """
+    """The problem linearized `about` values (K,), with the `excess` there, and a likely set in it."""
 
     about: Array
     excess: float
     sets: Sets
     state: State
-    keeps: bool
 
     @property
     def score(self) -> float:
         return self.sets.score(self.state)
 
 
-#: Linearizes about values (K,), and finds a set from some groups (G,) on too; None where the model has no intensities.
-Look = Callable[[Array, BoolArray | None], _Round | None]
+#: Linearizes about values (K,), and finds a set; None where the model has no intensities.
+Look = Callable[[Array], _Round | None]
 
 
 def _expand(
@@ -144,14 +140,14 @@ def _expand(
 ) -> tuple[Array, Sets, State, dict[int, tuple[int, ...]]]:
     """Values (K,) about which it was linearized, the sets there, the likeliest of them, and what does as well."""
 
-    def look(x: Array, initial: BoolArray | None = None) -> _Round | None:
+    def look(x: Array) -> _Round | None:
         problem.relinearize(space, x)
         sums = problem.sums(space, x)
         form = quadratic(problem, space, x, sums)
         if not (np.isfinite(form.excess) and np.all(np.isfinite(form.curvature))):
             return None
         sets = Sets(form, groups, noise_of(problem, sums))
-        return _Round(x, form.at(x / space.joined("typical")), sets, likely_set(sets, initial), initial is not None)
+        return _Round(x, form.at(x / space.joined("typical")), sets, likely_set(sets))
 
     first = look(start)
     assert first is not None, "the instrument as declared has no intensities"
@@ -164,7 +160,7 @@ def _expand(
         # One large cause: many others can explain it together, from which no straight line leads back to it.
         odds = np.where(first.sets.free, first.sets.conditional(first.sets.empty(), follow=True).log_odds, -np.inf)
         single = [int(np.argmax(odds))] if odds.max() > NEEDED else []
-    by_itself = [look(alone(problem, space, members[g]), np.arange(len(groups)) == g) for g in single]
+    by_itself = [look(alone(problem, space, members[g])) for g in single]
     begun += [trial for trial in by_itself if trial is not None and trial.score > first.score]
     ended = [_settle(problem, space, trial, look) for trial in begun if trial is not None]
     last = max(ended, key=lambda trial: trial.score)
@@ -189,7 +185,7 @@ def _of_bends(
         for j in (g for g in bends if first.state.tau[g] == 0):
             state = first.sets.without(first.state, k)
             state.tau[j] = first.state.tau[k]
-            trial = look(minimum_of(problem, space, first.sets, first.sets.settled(state)), None)
+            trial = look(minimum_of(problem, space, first.sets, first.sets.settled(state)))
             rounds += [trial] if trial is not None else []
     best = max(rounds, key=lambda trial: trial.score)
     problem.relinearize(space, best.about)
@@ -214,7 +210,7 @@ def _settle(problem: Problem, space: Space, first: _Round, look: Look) -> _Round
         x, settled = next_values(problem, space, now.sets, now.state, x=now.about)
         if settled:
             break
-        new = look(x, now.state.tau > 0 if now.keeps else None)
+        new = look(x)
         if new is None:
             break
         noise, prediction = now.sets.noise, now.sets.form.at(x / space.joined("typical"))

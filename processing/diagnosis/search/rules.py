@@ -36,7 +36,7 @@ SMOOTH = 0.3
 
 # ---- noise ---------------------------------------------------------------------------------------------------------
 #: [standard deviations] Total excess over the noise's own chi-square up to which it is no structure; of information
-#: about a typical size below which an effect cannot be seen, and what the fit may lose by groups that take no part.
+#: about a typical size below which an effect cannot be seen.
 SLACK = 2.0
 #: [of its variance] Standard error of the noise itself: no gain is known better than to half a percent. Of two million
 #: intensities that is five times what chance does to their sum of squares.
@@ -71,7 +71,7 @@ DARK_NOISE_OFF = 0.5
 #: the light in dim pixels, of the noise in image derivatives, of the noise that neighbours share.
 SMALL = 0.05
 #: [of the whole] A part that changes nothing: weak beliefs, first damping, least width of a prior and of a noise,
-#: how close to a bound a value stands there, and the misfit of an effect's model, which is never exact.
+#: and how much worse another branch of the train may fit.
 LITTLE = 1e-3
 #: [of what is usual] Least part of the variance that weights are made of.
 LEAST_PART = 0.01
@@ -105,14 +105,10 @@ WORSE = 1.002
 CHANCE_WORSE = 0.5
 #: [of m00] Least change of M/m00 that is asked for its error: less is the rounding of counts.
 LEAST_CHANGE = 2e-5
-#: [1] Growth of the condition number of W that a correction may cause: beyond it the states would be other ones.
-WORSE_CONDITION = 1.5
 
 # ---- structure -----------------------------------------------------------------------------------------------------
 #: [standard deviations] Beyond which a test of the residual says "structure", and a pixel is not dark.
 LIMIT = 5.0
-#: [standard deviations] The same of two of the six tests of one capture: as likely by chance as one beyond `LIMIT`.
-LIMIT_OF_TWO = 3.5
 #: [pixels] Below which means over them tell no noise, no black level and no pattern.
 FEWEST_PIXELS = 30
 
@@ -140,8 +136,6 @@ MOST_RANKED = 10
 #: to move. Where it does they show 0.5 to 1.1 of it, and it explains 0.5 to 0.7 of what they do; of light that is
 #: added, or a spot that fades, one of the two is 0 to 0.4.
 EDGES = 0.43
-#: [of what it explains] The same, for a large effect.
-UNEVEN_SHARE = 0.01
 #: [of the directions of the data] What values for each state, with all others, may have.
 TESTABLE = 0.75
 #: [1] With structure left something is there that is not in the list, and causes that are may be parts of it: one alone

@@ -14,7 +14,7 @@ from processing.diagnosis.search.causes import causes, observable_effects
 from processing.diagnosis.search.correction import solution
 from processing.diagnosis.search.decision import Judgement, beyond_chance, in_words
 from processing.diagnosis.search.fit import Fit, Solution
-from processing.diagnosis.search.names import AT_BOUND, Names, at_bound, with_parts
+from processing.diagnosis.search.names import Names, with_parts
 from processing.diagnosis.search.posterior import Posterior, Say, fit_posterior
 from processing.diagnosis.search.range_of import least_apart, rank_of
 from processing.diagnosis.search.result import CaptureReport, Correction, Diagnosis
@@ -91,7 +91,7 @@ def names_of(posterior: Posterior, wider: Array, chi2: float) -> Names:
     Their errors are `wider` (K,) than slopes promise.
     """
     likely, part = [c for c in causes(posterior, chi2) if c.probability >= LIKELY], dict(posterior.space.pairs)
-    doubt = with_parts(posterior, likely, {c: AT_BOUND for c in likely if at_bound(c)}, chi2=chi2, noise_known=True)
+    doubt = with_parts(posterior, likely, {}, chi2=chi2, noise_known=True)
     named = []
     for cause in (c for c in likely if c not in doubt):
         factors = [np.outer(wider[part[c]], wider[part[c]]) for c in cause.candidates]

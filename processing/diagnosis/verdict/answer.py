@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, information, significance, wanted_for_evidence
-from processing.diagnosis.search.decision import Judgement, held_out_check, refusal, rows_checks
+from processing.diagnosis.search.decision import Judgement, held_out_check, refusal
 from processing.diagnosis.search.fit import HeldOut, Solution
 from processing.diagnosis.search.names import Names, answer_of
 from processing.diagnosis.search.posterior import Posterior
@@ -213,20 +213,15 @@ def unobservable(problem: Problem, posterior: Posterior) -> list[Candidate]:
 
 
 def checks(problem: Problem, solved: Solution) -> tuple[Check, ...]:
-    """Held-out residual, rank and condition of W, before and after: if one gets worse, it is no explanation."""
+    """Held-out residual before and after: if it gets worse, that is no explanation."""
     held_out = solved.before, solved.after
     figures = [held_out_check(*(error(problem, solved, part) for part in held_out))]
-    several, rows = len(problem.captures) > 1, []
-    for k, data in enumerate(problem.captures):
-        if several:
-            # The sum decides; what became of each is told also where nothing is written.
-            old, new = (error(problem, solved, part.of(k), k).rms_percent for part in held_out)
-            name = f"rms on held-out data of {data.name} at {data.wavelength_nm:g} nm, percent"
-            figures.append(Check(name=name, before=old, after=new, holds=True))
-        where = f"{data.name} at {data.wavelength_nm:g} nm" if several else data.name
-        before, after = (problem.rows(k, space, fit.values) for space, fit in solved.ends)
-        rows.append((where, before, after))
-    return *figures, *rows_checks(rows)
+    for k, data in enumerate(problem.captures if len(problem.captures) > 1 else ()):
+        # The sum decides; what became of each is told also where nothing is written.
+        old, new = (error(problem, solved, part.of(k), k).rms_percent for part in held_out)
+        name = f"rms on held-out data of {data.name} at {data.wavelength_nm:g} nm, percent"
+        figures.append(Check(name=name, before=old, after=new, holds=True))
+    return tuple(figures)
 
 
 @dataclass(frozen=True)
