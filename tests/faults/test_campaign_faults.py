@@ -19,6 +19,7 @@ from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
 from processing.instrument.model import InstrumentModel
 from simulators.serial.reply_faults import Fault
+from tests.rig_files import with_values
 
 FAULTS = int(os.environ.get("UMOV_FAULTS", "8"))
 FULL = FAULTS >= 100
@@ -132,10 +133,9 @@ def test_a_night_of_captures_reads_an_instrument_s_file_once(configs, tmp_path, 
 def test_unattended_campaign_survives_random_faults(quick_rig, intact, configs, tmp_path):
     # Short waits, so that a stalled axis does not cost the test its minutes.
     rig_file = quick_rig(flux_e_per_s=8e6)
-    text = rig_file.read_text()
-    for line in ("port: sim:rotators", "port: sim:arm"):
-        text = text.replace(line, f"{line}, stall_s: 0.4, margin_s: 0.5, reply_s: 0.2")
-    rig_file.write_text(text)
+    short = {"stall_s": 0.4, "margin_s": 0.5, "reply_s": 0.2}
+    values = {f"axes.{axis}.{wait}": s for axis in ("psg", "psa", "arm") for wait, s in short.items()}
+    with_values(rig_file, values, rig_file)
     config = load_rig(rig_file)
     campaign = _campaign(tmp_path, configs)
     jobs = campaign_run.prepare(campaign, config)

@@ -15,6 +15,7 @@ from acquisition.rig.forbidden_poses import find_forbidden
 from acquisition.rig.open_rig import open_rig
 from acquisition.rig.parts import ForbiddenPose
 from drivers.errors import LimitError
+from tests.rig_files import with_values
 
 LOW, HIGH = -90.0, 400.0
 
@@ -31,7 +32,7 @@ def limited_rig(small_rig):
             ],
         }
     )
-    path.write_text(path.read_text().replace("address: 1}", f"address: 1, limits_deg: [{LOW}, {HIGH}]}}", 1))
+    with_values(path, {"axes.psg.limits_deg": [LOW, HIGH]}, path)
     with open_rig(load_rig(path), with_camera=False) as rig:
         rig.home(rig.unhomed())
         rig.move({"arm": 90.0})
