@@ -16,15 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dlauum, dtrtri, dtrtrs
-from scipy.special import betaln
 
 from processing.arrays import Array
 from processing.diagnosis.search.rules import MANY, TAU, TAU_WEIGHT, TAU_WEIGHT_OF_MANY
 
 #: [log odds] Of an impossible set, below the evidence of any data.
 NEVER = -1e9
-#: [groups] That are not there, at least, in the odds of one more.
-FEWEST_ABSENT = 0.1
+#: [1] Rates of causes, -1 to 1 for 0 to 1, and the weight of each in the prior's integral over them (Gauss, Legendre).
+RATES, WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 
 @dataclass(frozen=True)
@@ -133,7 +132,7 @@ class Conditional(SetFit):
 
 
 class Sets:
-    """Sets of groups in one quadratic problem; `count` is the number of groups that might be there."""
+    """Sets of groups in one quadratic problem."""
 
     def __init__(self, form: Quadratic, groups: Sequence[Group], noise: Noise) -> None:
         self.form, self.groups, self.noise = form, tuple(groups), noise
@@ -142,8 +141,11 @@ class Sets:
         self.price = np.array([g.price for g in groups])
         self.alone = np.array([g.alone for g in groups], dtype=bool)
         self.size = form.gradient.size
-        # The alternatives of one group count once.
-        self.count = float(np.sum(np.exp(-self.price[self.free]) / self.share[self.free]))
+        # One of several alternatives, or a sentence with a price, is there less often than a cause: of each such weight
+        # (W,) the log probability (R, W) to be there, and not to be, at each rate.
+        weights, self._weight = np.unique(np.exp(-self.price) / self.share, return_inverse=True)
+        present = (1 + RATES[:, None]) / 2 * weights
+        self._log_present, self._log_absent = np.log(present), np.log1p(-present)
         self.taus = TAU
         sizes = np.array([g.index.size for g in groups])
         self.tau_weight = np.where((sizes >= MANY)[:, None], TAU_WEIGHT_OF_MANY, TAU_WEIGHT)
@@ -183,17 +185,27 @@ class Sets:
 
         So the rate is learnt from how many groups there are.
         """
-        k, n = float(is_included.sum()), self.count
-        count = betaln(1 + k, max(n - k, 0.0) + 1) - betaln(1, n + 1)
         too_many = max(float((is_included & self.alone).sum()) - 1, 0.0)
-        return float(count - np.log(self.share[is_included]).sum() - self.price[is_included].sum()) + NEVER * too_many
+        return float(np.logaddexp.reduce(self._at_rates(is_included))) + NEVER * too_many
+
+    def _at_rates(self, is_included: NDArray[np.bool_]) -> Array:
+        """Log of the part (R,) that each rate has in the probability of a set."""
+        present, absent = (
+            np.bincount(self._weight[self.free & which], minlength=self._log_present.shape[1])
+            for which in (is_included, ~is_included)
+        )
+        return np.asarray(np.log(WEIGHTS / 2) + self._log_present @ present + self._log_absent @ absent)
 
     def prior_odds(self, is_included: NDArray[np.bool_]) -> Array:
-        """Log odds (G,) of each group to be there, of the prior, given the others of a set."""
-        other_count = is_included.sum() - is_included
-        absent_count = np.maximum(self.count - other_count, FEWEST_ABSENT)
+        """Log odds (G,) of each free group to be there, of the prior, given the others of a set."""
+        at_rates = self._at_rates(is_included)[:, None]
+        of_absent, of_present = (
+            np.logaddexp.reduce(at_rates - own + self._log_present)
+            - np.logaddexp.reduce(at_rates - own + self._log_absent)
+            for own in (self._log_absent, self._log_present)
+        )
         beside = np.where(self.alone, (is_included & self.alone).sum() - (is_included & self.alone), 0.0)
-        return np.asarray(np.log((1 + other_count) / absent_count / self.share) - self.price) + NEVER * beside
+        return np.asarray(np.where(is_included, of_present[self._weight], of_absent[self._weight]) + NEVER * beside)
 
     def fitted(self, state: State) -> SetFit:
         """Posterior of the parameters that are there."""
