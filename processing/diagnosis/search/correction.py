@@ -9,7 +9,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import Fit, Solution, held_out, minimize
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import LIKELY, LITTLE, SURE, TAKES_PART
+from processing.diagnosis.search.rules import LIKELY, LITTLE, SLACK, SURE, TAKES_PART
 from processing.diagnosis.search.space import Problem, Space
 
 
@@ -22,12 +22,34 @@ def applied(posterior: Posterior, base: Space, unfit: Collection[Candidate] = ()
         if cause.probability >= LIKELY:
             shares = [by_label[c] for c in cause.alternatives if posterior.samples.probability[by_label[c]] > 1 - SURE]
             keep.update(cause.candidates, (posterior.space.candidates[m] for g in shares for m in posterior.members[g]))
-    for g in np.flatnonzero(posterior.samples.probability > TAKES_PART):
+    for g in _least_needed(posterior, keep):
         keep |= {posterior.space.candidates[m] for m in posterior.members[g]}
     keep -= set(unfit)
     order = [*base.candidates, *(c for c in posterior.space.candidates if c in keep and c not in base.candidates)]
     space = Space(tuple(order))
     return space, space.vector(posterior.space.split(posterior.values))
+
+
+def _least_needed(posterior: Posterior, keep: Collection[Candidate]) -> list[int]:
+    """Groups in addition to `keep` that are likely enough, and further groups without which the fit gets worse.
+
+    Several groups that are unlikely one by one can be one cause together: the mean has a part of each, and these parts
+    fit only together.
+    """
+    space, form = posterior.space, posterior.sets.form
+    order = np.argsort(-posterior.samples.probability)
+    is_used = np.concatenate([np.zeros(0, dtype=bool), *(np.full(c.size, c in keep) for c in space.candidates)])
+    mean = posterior.values / space.joined("typical")
+    chi2_at_mean = form.at(mean)
+    groups: list[int] = []
+    for g in order:
+        loss = form.at(np.where(is_used, mean, 0.0)) - chi2_at_mean
+        if posterior.samples.probability[g] <= TAKES_PART and loss <= SLACK**2 * posterior.samples.best.unit:
+            break
+        groups.append(int(g))
+        for m in posterior.members[g]:
+            is_used[space.slices[m]] = True
+    return groups
 
 
 def solution(
