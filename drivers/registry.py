@@ -34,7 +34,7 @@ def device_kinds(family: Family) -> dict[str, ModuleType]:
         for entry in pkgutil.iter_modules(folder.__path__)
         if not entry.name.startswith("_")
     }
-    for plugin in entry_points(group=f"umov.{family}"):
+    for plugin in _plug_ins().select(group=f"umov.{family}"):
         if plugin.name in kinds:
             raise ValueError(
                 f"plug-in {plugin.value} offers the kind {plugin.name!r} of {family}, which exists already"
@@ -44,6 +44,12 @@ def device_kinds(family: Family) -> dict[str, ModuleType]:
             raise ValueError(f"plug-in {plugin.value} for {family} needs a `Config` and a function `open`")
         kinds[plugin.name] = module
     return dict(sorted(kinds.items()))
+
+
+@cache
+def _plug_ins() -> Any:
+    # Of all groups: each question reads the records of every installed package.
+    return entry_points()
 
 
 def open_axis(name: str, config: AxisConfig, lines: LineRegistry) -> MotionAxis:

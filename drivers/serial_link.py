@@ -148,6 +148,9 @@ class SerialLink:
                 if waiting == 0 and left_s <= 0:
                     return None
                 data = self._serial.read(max(1, waiting))
+                if data and not waiting:
+                    # The byte that ended the wait seldom comes alone.
+                    data += self._serial.read(self._serial.in_waiting)
             if data and self._transcript is not None:
                 self._transcript.note("<<", data)
             self._buffer += data

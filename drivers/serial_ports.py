@@ -122,12 +122,13 @@ def port_holders(port: str) -> list[tuple[int, str]]:
     """
     target = os.path.realpath(port)
     holders = []
-    for process in Path("/proc").glob("[0-9]*"):
+    # By names, not by paths: a machine has some hundred processes with some ten files each.
+    for pid in filter(str.isdigit, os.listdir("/proc")):
         try:
-            is_open = any(os.readlink(entry) == target for entry in (process / "fd").iterdir())
-            if is_open:
-                name = (process / "comm").read_text().strip()
-                holders.append((int(process.name), f"{name} (pid {process.name})"))
+            folder = f"/proc/{pid}/fd"
+            if any(os.readlink(f"{folder}/{number}") == target for number in os.listdir(folder)):
+                name = Path(f"/proc/{pid}/comm").read_text().strip()
+                holders.append((int(pid), f"{name} (pid {pid})"))
         except OSError:
             continue
     return holders

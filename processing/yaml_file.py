@@ -86,18 +86,19 @@ class _BoundedComposer(Composer):
 def parse_yaml(text: str, model: type[Model], source: str = "text") -> Model:
     """Validate YAML text as `model`; `source` names it in errors. Raises ConfigError."""
     tree = _tree(text, source)
-    if lines := _not_meant(source, tree):
+    written = _written(text)
+    if lines := _not_meant(source, tree, written):
         raise _refusal(source, lines)
     try:
         value = model.model_validate(_plain(tree))
     except ValidationError as error:
         lines = _describe(source, tree, model, mistakes_of(error))
         places = {line.split(" ", 1)[0] for line in lines}
-        more = [line for line in _not_finite(source, tree, _scalars(tree)) if line.split(" ", 1)[0] not in places]
+        more = [line for line in _not_finite(source, tree, written) if line.split(" ", 1)[0] not in places]
         raise _refusal(source, lines + more) from error
     # As the model understood them: the text "nan" and the word true become numbers where one is asked for.
     understood = list(_scalars(value.model_dump(exclude_unset=True)))
-    lines = _not_finite(source, tree, understood) + _truths_as_numbers(source, tree, understood)
+    lines = _not_finite(source, tree, understood) + _truths_as_numbers(source, tree, written, understood)
     lines += _beyond(source, tree, understood)
     if lines:
         raise _refusal(source, lines)
@@ -112,23 +113,25 @@ def _not_finite(source: str, tree: CommentedMap, values: Iterable[_Scalar]) -> l
     ]
 
 
-def _truths_as_numbers(source: str, tree: CommentedMap, understood: Iterable[_Scalar]) -> list[str]:
+def _truths_as_numbers(
+    source: str, tree: CommentedMap, written: Sequence[_Scalar], understood: Iterable[_Scalar]
+) -> list[str]:
     became = dict(understood)
     return [
         f"{_place(source, tree, where)}: must be a number, not {str(value).lower()}"
-        for where, value in _scalars(tree)
+        for where, value in written
         if isinstance(value, bool) and type(became.get(where)) in (int, float)
     ] + [
         f"{_place(source, tree, where)}: write numbers without _"
-        for where, value in _scalars(tree)
+        for where, value in written
         if isinstance(value, str) and "_" in value and value != where[-1] and type(became.get(where)) in (int, float)
     ]
 
 
-def _not_meant(source: str, tree: CommentedMap) -> list[str]:
+def _not_meant(source: str, tree: CommentedMap, written: Sequence[_Scalar]) -> list[str]:
     """Texts with control characters, which would reach a terminal, and numbers with underscores."""
     lines = []
-    for where, value in _scalars(tree):
+    for where, value in written:
         if isinstance(value, str) and not is_line(value.replace("\n", "").replace("\t", "")):
             lines.append(f"{source}:{_line(tree, where)}: control characters in a text")
         elif getattr(value, "_underscore", None):
@@ -176,6 +179,11 @@ def _parse(text: str) -> Any:
     yaml = YAML(typ="rt")
     yaml.Composer = _BoundedComposer
     return yaml.load(text)
+
+
+@functools.lru_cache(maxsize=64)
+def _written(text: str) -> tuple[_Scalar, ...]:
+    return tuple(_scalars(_parse(text)))
 
 
 def named_files(path: Path) -> Iterator[tuple[str, Path]]:

@@ -1,6 +1,7 @@
 """Header, title and file name of a capture, which are known before its first state."""
 
 import datetime
+import functools
 import json
 import platform
 import re
@@ -54,6 +55,7 @@ def _illumination(instrument: InstrumentModel) -> str | None:
     return "horizontal" if s[1] > 0 else "vertical"
 
 
+@functools.cache
 def versions() -> dict[str, str]:
     """Versions of what made the file."""
     from importlib.metadata import version

@@ -8,12 +8,14 @@ One camera occupies one address. A second one at the same time needs a second lo
 with `ip addr add 127.0.0.2/8 dev lo`.
 """
 
+import functools
 import struct
 import threading
 import time
 from collections import deque
 from pathlib import Path
 from typing import Self
+from xml.etree.ElementTree import Element
 
 from drivers.errors import CameraError
 from drivers.pixel_formats import pixel_format_of
@@ -37,6 +39,23 @@ _KEPT_FRAMES = 4
 _FREE_RUN_S = 0.05
 # Registers of the link, which a user set does not hold: control, heartbeat, streams, and location of the XML.
 _LINK = ((0x000, 0x100), (0x200, 0x240), (0x600, 0x604), (0x900, 0xA04), (0xB00, 0xB20), (0xD00, 0xD20))
+
+
+@functools.lru_cache(maxsize=16)
+def _powered_up(
+    root: Element, source: Path, sensor: tuple[int, int], serial: str
+) -> tuple[RegisterMemory, NodeTree, dict[str, str]]:
+    """Memory, features and identity of a camera that is switched on: tests switch a few on some hundred times."""
+    texts = {
+        "DeviceVendorName": root.get("VendorName") or "unknown",
+        "DeviceModelName": root.get("ModelName") or "unknown",
+        "DeviceVersion": "simulated",
+        "DeviceID": serial,
+    }
+    memory = RegisterMemory()
+    nodes = NodeTree(root, memory, source)
+    power_up(nodes, sensor, {**texts, "DeviceSerialNumber": serial})
+    return memory, nodes, texts
 
 
 class GigeCamera:
@@ -118,17 +137,10 @@ class GigeCamera:
 
     def _prepare(self) -> None:
         description = self._description
-        root = description.root
-        texts = {
-            "DeviceVendorName": root.get("VendorName") or "unknown",
-            "DeviceModelName": root.get("ModelName") or "unknown",
-            "DeviceVersion": "simulated",
-            "DeviceID": self.serial,
-        }
-        self._memory = RegisterMemory()
-        self._nodes = NodeTree(root, self._memory, description.source)
         try:
-            power_up(self._nodes, self._sensor, {**texts, "DeviceSerialNumber": self.serial})
+            memory, nodes, texts = _powered_up(description.root, description.source, self._sensor, self.serial)
+            self._memory = memory.copy()
+            self._nodes = nodes.copy(self._memory)
             self._features = FeatureValues(self._nodes, self._sensor, complete=self._complete)
             for name, value in description.at_power_up.items():
                 if name in self._nodes:

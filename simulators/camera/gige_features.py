@@ -1,5 +1,6 @@
 """The GenICam description of a camera with the features of a table; the registers behind them are ours."""
 
+import functools
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -129,8 +130,12 @@ def describe(name: str, size: tuple[int, int]) -> Description:
     if is_description(name):
         return read_description(Path(name))
     table = node_map(name)
-    text, source = description(table, *size).encode(), Path(name)
-    return Description(text, "camera.xml", read_tree(source, text), source, table.arming_s, _AT_POWER_UP)
+    return _of_table(description(table, *size).encode(), Path(name), table.arming_s)
+
+
+@functools.lru_cache(maxsize=16)
+def _of_table(text: bytes, source: Path, arming_s: float) -> Description:
+    return Description(text, "camera.xml", read_tree(source, text), source, arming_s, _AT_POWER_UP)
 
 
 def description(table: NodeMap, width: int, height: int) -> str:

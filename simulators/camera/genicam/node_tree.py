@@ -4,6 +4,7 @@ Node types and their children are those of the GenApi module of the GenICam stan
 them: Integer, Float, Enumeration, Boolean, Command, the registers with computed addresses, SwissKnife and Converter.
 """
 
+import copy
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -57,6 +58,13 @@ class NodeTree:
         self._assumed: dict[str, Number] = {}
         self._formulas: dict[tuple[str, str], Formula] = {}
         self._way: list[str] = []
+
+    def copy(self, memory: RegisterMemory) -> "NodeTree":
+        """The same features with the same values of their own, whose registers stand in another memory."""
+        duplicate = copy.copy(self)
+        duplicate._memory = memory
+        duplicate._values, duplicate._assumed, duplicate._way = dict(self._values), {}, []
+        return duplicate
 
     def _collect(self, parent: Element) -> None:
         for node in parent:
