@@ -83,7 +83,8 @@ def slopes(vector, by_element, covariance, out, start, stop):  # type: ignore[no
     for first in range(start, stop, _RUN):
         count = min(_RUN, stop - first)
         for i in range(n):
-            v[i, :count] = vector[i, first : first + count]
+            for p in range(count):
+                v[i, p] = vector[i, first + p]
             for j in range(i + 1):
                 c[i, j] = 0
             for k in range(16):
@@ -173,8 +174,7 @@ def _moments(c, v, by, moved, sums, out, first, count):  # type: ignore[no-untyp
     place = 6
     for apart in range(3):
         for i in range(3 - apart):
-            packed = out[place, first : first + count]
-            packed[:] = np.nan
-            if i + apart < n:
-                packed[:] = c[i + apart, i, :count]
+            # No slice: the check of its length takes numba 3 s to compile, most of it for a message.
+            for p in range(count):
+                out[place, first + p] = c[i + apart, i, p] if i + apart < n else np.float32(np.nan)
             place += 1
