@@ -138,21 +138,20 @@ class Cost:
     def __call__(self, x: Array) -> tuple[float, Array]:
         """Logarithm of the cost, and its gradient."""
         angles, retardances = self.split(x)
-        u = self._weighted(self.rows(angles, retardances), angles, retardances)
+        # A row has angles of its own alone: those of all steps are made at once.
+        steps = [sign * STEP * axis[:, None] for axis in np.eye(len(self.axes)) for sign in (1, -1)]
+        w, *stepped = np.split(
+            self.rows(np.hstack([angles, *(angles + s for s in steps)]), retardances), 1 + len(steps)
+        )
+        u = self._weighted(w, angles, retardances)
         information = self._information(u)
         # A little of the unit matrix keeps the first steps of a poor start finite.
         inverse = np.linalg.inv(information + 1e-9 * np.trace(information) * np.eye(len(information)))
         cost = float(np.trace(inverse))
         square = inverse @ inverse
-        gradient = np.empty_like(angles)
-        for k in range(len(self.axes)):
-            step = np.zeros((len(self.axes), 1))
-            step[k] = STEP
-            power = []
-            for moved in (angles + step, angles - step):
-                v = self._weighted(self.rows(moved, retardances), moved, retardances)
-                power.append(np.einsum("nci,ij,ncj->n", v, square, v))
-            gradient[k] = -(power[0] - power[1]) / (2 * STEP)
+        moved = (self._weighted(w, angles + s, retardances) for w, s in zip(stepped, steps, strict=True))
+        power = np.array([np.einsum("nci,ij,ncj->n", v, square, v) for v in moved])
+        gradient = -(power[::2] - power[1::2]) / (2 * STEP)
         by_retardance = np.empty_like(retardances)
         for k in range(retardances.size):
             step = np.zeros_like(retardances)
