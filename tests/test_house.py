@@ -18,9 +18,11 @@ PACKAGES = ("drivers", "processing", "simulators", "acquisition", "viewer")
 
 
 @cache
-def parsed(file: Path) -> ast.Module:
-    """A module's tree: several tests walk all of them."""
-    return ast.parse(file.read_text(encoding="utf-8"))
+def outline(file: Path) -> tuple[list[str], list[ast.Import | ast.ImportFrom]]:
+    """Classes and imports of a module; its tree would stay for garbage collection to walk."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+    return classes, [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
 
 
 def imports(root: Path) -> dict[str, set[str]]:
@@ -33,7 +35,7 @@ def imports(root: Path) -> dict[str, set[str]]:
     edges = {}
     for module, file in files.items():
         targets = set()
-        for node in ast.walk(parsed(file)):
+        for node in outline(file)[1]:
             if isinstance(node, ast.ImportFrom) and node.module:
                 names = (f"{node.module}.{alias.name}" for alias in node.names)
                 targets |= {name if name in files else node.module for name in names}
@@ -51,9 +53,9 @@ def test_one_class_name_is_one_class():
     places: dict[str, list[str]] = {}
     for package in PACKAGES:
         for file in (ROOT / package).rglob("*.py"):
-            for node in parsed(file).body:
-                if isinstance(node, ast.ClassDef) and node.name not in OF_EACH_KIND:
-                    places.setdefault(node.name, []).append(str(file.relative_to(ROOT)))
+            for name in outline(file)[0]:
+                if name not in OF_EACH_KIND:
+                    places.setdefault(name, []).append(str(file.relative_to(ROOT)))
     assert {name: files for name, files in places.items() if len(files) > 1} == {}
 
 
