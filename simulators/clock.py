@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 from drivers import clock as driver_clock
 
@@ -133,7 +133,7 @@ class ManualClock(FastClock):
         self._now_s += max(0.0, duration_s)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TrapezoidMotion:
     """Position in time of a motor that accelerates, runs, and brakes with the same constant acceleration.
 
@@ -159,7 +159,7 @@ class TrapezoidMotion:
         """Highest speed reached."""
         return self.speed if math.isinf(self.acceleration) else self.ramp_s * self.acceleration
 
-    @property
+    @cached_property
     def duration_s(self) -> float:
         """Time from start to rest."""
         distance = abs(self.target - self.start)

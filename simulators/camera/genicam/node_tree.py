@@ -18,6 +18,7 @@ from simulators.camera.genicam.formula import Formula, FormulaError, Number
 from simulators.camera.genicam.register import Register, RegisterMemory
 
 REGISTERS = ("IntReg", "MaskedIntReg", "StructEntry", "FloatReg", "StringReg", "Register")
+_MOVES = ("pAddress", "pLength", "pIndex", "IntSwissKnife")
 _FORMULAS = ("IntSwissKnife", "SwissKnife")
 _CONVERTERS = ("IntConverter", "Converter")
 _VARIABLES = ("Integer", "Float", "Enumeration", "Boolean", "Command", "String")
@@ -57,6 +58,8 @@ class NodeTree:
         self._values: dict[str, Number] = {}
         self._assumed: dict[str, Number] = {}
         self._formulas: dict[tuple[str, str], Formula] = {}
+        # Registers whose address and length follow from no other node.
+        self._fixed: dict[str, Register] = {}
         self._way: list[str] = []
 
     def copy(self, memory: RegisterMemory) -> "NodeTree":
@@ -225,8 +228,16 @@ class NodeTree:
 
     def register(self, name: str) -> Register:
         """Where the value of a register node stands now. Raises NodeError."""
+        if name in self._fixed:
+            return self._fixed[name]
         node = self.node(name)
         place = self._around.get(name, node)
+        register = self._register(name, node, place)
+        if not any(child.tag in _MOVES for child in place):
+            self._fixed[name] = register
+        return register
+
+    def _register(self, name: str, node: Element, place: Element) -> Register:
         length = self._sum(name, place, "Length", "pLength")
         if not 0 < length <= _LONGEST_REGISTER:
             raise self.error(name, f"has {length} bytes")
