@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 # Each capture draws its figure in a process that is forked for it. What is loaded here need not be loaded there.
 import matplotlib.backends.backend_agg  # noqa: F401
-import matplotlib.figure  # noqa: F401
+import matplotlib.figure
 import numpy as np
 import pytest
 
@@ -230,12 +230,18 @@ def acquire(
 def process(
     run_main: Callable[..., tuple[int, str, str]], request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Any:
-    """Runs `process`, as `run_main` does; without `figures` the figure of a product is an empty file."""
+    """Runs `process`, as `run_main` does; without `figures` a figure is an empty file."""
     from processing.commands.application import main
     from tests.commands import Program
 
     if "figures" not in request.fixturenames:
         monkeypatch.setattr("processing.reports.figures.draw_product", lambda path, figure: figure.touch())
+        save = matplotlib.figure.Figure.savefig
+
+        def touch(figure: matplotlib.figure.Figure, to: Any, **options: Any) -> None:
+            Path(to).touch() if isinstance(to, str | Path) else save(figure, to, **options)
+
+        monkeypatch.setattr("matplotlib.figure.Figure.savefig", touch)
     return Program(partial(run_main, main))
 
 

@@ -71,6 +71,7 @@ def change_header(path: Path, **changes: object) -> None:
         h5["entry"].attrs["header_json"] = json.dumps(header)
 
 
+@pytest.mark.usefixtures("figures")
 def test_campaign_of_a_true_model_has_small_deviations(folder, configs, process):
     out = process.made("campaign", folder, *options(configs))
     assert "SIMULATED" in out
@@ -105,6 +106,7 @@ def of_film(folder):
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("figures")
 def test_without_a_geometry_every_capture_has_its_means(folder, configs, process, tmp_path):
     out = process.made("campaign", folder, "--out", tmp_path / "out")
     assert [line.split()[0] for line in out.splitlines() if ".h5" in line] == ["made"] * 4
@@ -188,6 +190,7 @@ def test_the_campaigns_own_air_corrects_its_instrument(configs, process, tmp_pat
     assert "no capture of air for --correct. Take one:" in process.refused("campaign", folder, "--correct")
 
 
+@pytest.mark.usefixtures("figures")
 def test_tables_compared_by_hand_give_the_campaigns_number(serial, configs, process, tmp_path):
     tables = [serial.tables[kind, 662.0] for kind in ("mueller", "stokes")]
     options = ["--geometry", configs / "geometries/one_inch_sphere.yaml", "--figure", tmp_path / "f.png"]
@@ -340,6 +343,7 @@ def test_tables_and_material_and_extrapolation(folder, configs, process, tmp_pat
             assert np.median(np.abs(pull)) / 0.6745 == pytest.approx(1, abs=0.15), name
 
 
+@pytest.mark.usefixtures("figures")
 def test_design_recommends_vertical_light(configs, process, tmp_path):
     camera = configs / "instruments/linear_stokes.yaml"
     figure = tmp_path / "design.png"

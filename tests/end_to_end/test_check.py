@@ -36,6 +36,7 @@ def air(tmp_path, configs):
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("figures")
 def test_what_changed_since_is_named_and_kept(air, process, tmp_path, monkeypatch):
     reference = air("reference", 1.0, 1)
     unchanged, _ = air("day_2", 1.0, 2, flux=4.9e5), air("glass", 1.0, 4, kind="unknown")

@@ -18,7 +18,15 @@ from processing.storage.captures.frame_layout import Beams, Cells, FrameLayout
 from processing.storage.captures.schema import SCHEMA_VERSION, CaptureHeader
 from processing.storage.captures.segments import Segment, decode_lines, segments_of
 from processing.storage.integrity.checksums import NONE, row_crc32, state_crc32, summed_values
-from processing.storage.integrity.h5_door import OpenH5, closed_if_damaged, damage_as, mark_of, open_h5, text_attribute
+from processing.storage.integrity.h5_door import (
+    OpenH5,
+    closed_if_damaged,
+    damage_as,
+    look_once,
+    mark_of,
+    open_h5,
+    text_attribute,
+)
 from processing.storage.integrity.unpacking import KeptChunks, is_packed, read_rows
 from processing.yaml_file import parse_yaml
 
@@ -84,7 +92,7 @@ class Capture(OpenH5):
             )
         entry = self._h5["entry"]
         self.header = CaptureHeader.model_validate_json(text_attribute(entry, "header_json"))
-        check_capture(entry, self.header)
+        look_once(self._h5, check_capture, entry, self.header)
         self.simulated: bool = bool(entry.attrs["simulated"])
         status = entry.attrs["status"]
         self.status: str = status.decode() if isinstance(status, bytes) else str(status)

@@ -1,10 +1,12 @@
 """The door for HDF5 and .npy files: names, types and shapes are looked at before anything is read."""
 
 import os
+import threading
+import time
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
@@ -26,6 +28,13 @@ DAMAGE = (
 MOST_STATES = 100_000
 #: Most groups and datasets of a file; ours have a few hundred.
 MOST_LINKS = 20_000
+#: Files that have passed a check, by their state then: a campaign opens each capture many times.
+_passed: set[tuple[Any, ...]] = set()
+MOST_KEPT = 4096
+#: A file that is younger may change again within the same tick of its clock.
+SETTLED_NS = 100_000_000
+#: The header is Python's text, and Python 3.11 cannot parse in two threads: "AST constructor recursion depth mismatch".
+_parsing = threading.Lock()
 #: A compressed dataset larger than this many times its storage is none that a camera made (deflate ends at 1032).
 MOST_RATIO = 1100
 
@@ -43,8 +52,21 @@ def open_h5(path: Path, error: type[ProcessError], hint: str = "") -> h5py.File:
         text = f"{path} cannot be opened as HDF5 ({one_line(why)}). It is truncated or damaged. {hint}"
         raise error(text.strip()) from why
     with closed_if_damaged(h5, error, f"{path} cannot be read"):
-        _require_own(h5)
+        look_once(h5, _require_own, h5)
     return h5
+
+
+def look_once(h5: h5py.File, check: Callable[..., None], *arguments: Any) -> None:
+    """Call a check that raises, unless the same file has passed it and has not changed since then."""
+    status = os.fstat(h5.id.get_vfd_handle())
+    mark = (check, status.st_dev, status.st_ino, status.st_size, status.st_ctime_ns)
+    if mark in _passed:
+        return
+    check(*arguments)
+    if time.time_ns() - status.st_ctime_ns > SETTLED_NS:
+        if len(_passed) >= MOST_KEPT:
+            _passed.clear()
+        _passed.add(mark)
 
 
 def _require_own(h5: h5py.File) -> None:
@@ -183,7 +205,8 @@ def read_npy(path: Path, error: type[ProcessError], most_bytes: int | None = Non
         with open(path, "rb") as file:
             if file.read(len(MAGIC_PREFIX)) != MAGIC_PREFIX:
                 raise error(f"{path} is no .npy file")
-        values = np.load(path, mmap_mode="r", allow_pickle=False)
+        with _parsing:
+            values = np.load(path, mmap_mode="r", allow_pickle=False)
     except (*DAMAGE, SyntaxError, EOFError, tokenize.TokenError) as why:
         # The header is Python's text, and damaged text is a matter of its parser.
         raise error(f"{path} cannot be read as .npy ({one_line(why)})") from why
