@@ -14,8 +14,8 @@ def test_every_instrument_has_its_line(configs):
     assert set(BENCHES) == {path.stem for path in (configs / "instruments").glob("*.yaml")}
 
 
-#: An instrument of each kind: two plates, mosaic, Stokes, part of a matrix. The others are `long`.
-KINDS = {"rgb950", "mosaic_polarimeter", "rotating_retarder_stokes", "linear_mueller"}
+#: An instrument of each kind: two plates, mosaic, part of a matrix. The others are `long`.
+KINDS = {"rgb950", "mosaic_polarimeter", "rotating_retarder_stokes"}
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,8 @@ import random
 import threading
 from collections import Counter
 
+import pytest
+
 from acquisition.campaign import run as campaign_run
 from acquisition.campaign.log import CampaignFolder
 from acquisition.campaign.plan import Campaign
@@ -130,6 +132,7 @@ def test_a_night_of_captures_reads_an_instrument_s_file_once(configs, tmp_path, 
     assert len(jobs) > len(read) == len({job.plan.mode for _, job in jobs})
 
 
+@pytest.mark.long
 def test_unattended_campaign_survives_random_faults(quick_rig, intact, configs, tmp_path):
     # Short waits, so that a stalled axis does not cost the test its minutes.
     rig_file = quick_rig(flux_e_per_s=8e6)

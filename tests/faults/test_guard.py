@@ -136,7 +136,7 @@ def _guards_of(pid):
     return [number for number in pids if b"acquisition.rig.guard" in Path(f"/proc/{number}/cmdline").read_bytes()]
 
 
-@pytest.mark.parametrize("fault", ["silent", "garbled"])
+@pytest.mark.parametrize("fault", ["silent", pytest.param("garbled", marks=pytest.mark.long)])
 def test_a_light_that_acquire_cannot_shut_is_shut_by_the_guard(spawn, partial_of, plan_file, served, tmp_path, fault):
     """The shutter's line answers with noise or nothing; when it is well again the guard shuts the light."""
     simulation, rig, alarm_file = served
@@ -161,7 +161,9 @@ def test_a_light_that_acquire_cannot_shut_is_shut_by_the_guard(spawn, partial_of
     _until(lambda: "alarm acknowledged" in (tmp_path / "out" / "guard.jsonl").read_text())
 
 
-@pytest.mark.parametrize(("port", "fault"), [("rotators", "garbled"), ("arm", "silent")])
+@pytest.mark.parametrize(
+    ("port", "fault"), [("rotators", "garbled"), pytest.param("arm", "silent", marks=pytest.mark.long)]
+)
 def test_an_axis_whose_stop_is_not_confirmed_is_stopped_by_the_guard(
     spawn, partial_of, plan_file, served, tmp_path, port, fault
 ):

@@ -52,7 +52,14 @@ def full_disc(most_bytes=1000):
         sys.dont_write_bytecode = bytecode
 
 
-@pytest.mark.parametrize(("kind", "exists"), [(kind, kind in ("csv", "html")) for kind in WRITERS])
+@pytest.mark.parametrize(
+    ("kind", "exists"),
+    [
+        # A report draws and writes a picture too.
+        pytest.param(kind, kind in ("csv", "html"), marks=[pytest.mark.long] * (kind == "png"))
+        for kind in WRITERS
+    ],
+)
 def test_a_full_disc_leaves_nothing_half(product, kind, exists, tmp_path, capsys):
     command, *options = WRITERS[kind]
     out = tmp_path / f"out{ENDINGS.get(kind, f'.{kind}')}"

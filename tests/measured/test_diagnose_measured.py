@@ -160,7 +160,7 @@ def test_ten_wavelengths_share_their_mechanics(public_files, configs, tmp_path):
     ("wavelength_nm", "before", "after"),
     [
         pytest.param(450, 1.5, 0.6, marks=pytest.mark.long),
-        (850, 0.8, 0.55),
+        pytest.param(850, 0.8, 0.55, marks=pytest.mark.long),
         pytest.param(1000, 2.0, 1.2, marks=pytest.mark.long),
     ],
 )

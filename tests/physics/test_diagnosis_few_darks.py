@@ -61,7 +61,11 @@ EIGHT_BITS, QUIET = (490.0, 118.0, 8.4, 8), (490.0, 74.0, 8.6, 8)
 
 @pytest.mark.parametrize(
     ("camera", "darks", "texture"),
-    [(SIXTEEN_BITS, 4, 0.5), (EIGHT_BITS, 1, 0.5), pytest.param(QUIET, 4, 0.0, marks=pytest.mark.long)],
+    [
+        pytest.param(SIXTEEN_BITS, 4, 0.5, marks=pytest.mark.long),
+        (EIGHT_BITS, 1, 0.5),
+        pytest.param(QUIET, 4, 0.0, marks=pytest.mark.long),
+    ],
 )
 def test_noise_of_darks_is_no_fault_where_states_are_dark(camera, darks, texture, synthetic_capture):
     """Crossed polarizers let no light through in six of these states: the read-out and the darks are all the noise."""

@@ -55,7 +55,7 @@ def test_a_true_model_is_left_in_peace(scene, declared, tmp_path):
 @pytest.mark.parametrize(
     ("instrument", "kind"),
     [
-        ("rgb950", "registration"),
+        pytest.param("rgb950", "registration", marks=pytest.mark.long),
         pytest.param("rgb950", "illumination_azimuth", marks=pytest.mark.long),
         ("linear_stokes", "analyzer_roll"),
     ],
