@@ -54,7 +54,6 @@ def set_magnitudes(
     m: Array,
     image: ElementNoise,
     *,
-    turn: Array | float = 0.0,
     noises: Mapping[str, VectorNoise] | None = None,
 ) -> None:
     """Replace value and error of every length of a vector and of every angle, and add their 95 % intervals.
@@ -62,7 +61,6 @@ def set_magnitudes(
     Parameters
     ----------
     m : (..., 4, 4), the matrices of which `derived` is.
-    turn : (...), variance of the element of the dominant process that noise turns most.
     noises : noise of vectors that is known already, by the name of their length.
     """
     covariance = image.covariance()
@@ -77,37 +75,24 @@ def set_magnitudes(
         else:
             vector, scale = quantity.parts.value, np.ones(())
             noise = (noises or {}).get(name) or of_slopes(covariance, vector, quantity.parts.gradient)
-        wide, far = scale, np.ones(())
-        if name.startswith("dominant_"):
-            # Of the 68 and of the 95 % interval.
-            by = [_turned(turn, deviate) for deviate in (1.0, NORMAL_95)]
-            wide, far = scale * by[0], by[1] / by[0]
         length = np.asarray(quantity.value, dtype=float)
-        along, total, square = wide * noise.along, wide * noise.total, wide**2 * noise.square
-        plane = (wide**2 * noise.mixed, wide * noise.across, wide**2 * noise.further)
-        if name.startswith("dominant_"):
-            # A process is bent as well: what noise across adds to other lengths may be missing. Its mean square:
-            along = along + np.minimum((total**2 / 2 + square) / (2 * length**2), square / total)
-            plane = (0.0, 0.0, 0.0)
+        along, total, square = scale * noise.along, scale * noise.total, scale**2 * noise.square
+        plane = (scale**2 * noise.mixed, scale * noise.across, scale**2 * noise.further)
         moments = (along, total, square)
-        put(planes, name, *interval(length, *moments, plane=plane, far=far))
+        put(planes, name, *interval(length, *moments, plane=plane))
         for angle in ANGLES_OF.get(name, ()):
             if angle in planes:
                 direction = length * vector / np.hypot(*vector)
-                _set_angle(planes, angle, direction, wide * far * noise.packed[[0, 1, 3]], of_68=np.sqrt(1 / far))
+                set_angle(planes, angle, direction, scale * noise.packed[[0, 1, 3]])
 
 
-def _turned(turn: Array | float, deviate: float) -> Array:
-    """Variance of an element of the dominant process at so many errors from the truth, over that to first order.
+def set_angle(planes: Planes, name: str, vector: Array, covariance: Array, *, of_68: Array | float = 1.0) -> None:
+    """Fieller's interval for the direction of vectors (2, ...): all directions where they may be zero.
 
-    An element is a sine x: the gap that is seen makes the sine of twice the turn of two eigenvectors exact. To first
-    order its variance is that of no turn times 1 - x^2. `turn` is the variance of x where noise turns it most.
+    Parameters
+    ----------
+    of_68 : (...), errors for the 68 % interval over those for the 95 % interval, which `covariance` has.
     """
-    return np.asarray(1 + deviate**2 * turn)
-
-
-def _set_angle(planes: Planes, name: str, vector: Array, covariance: Array, *, of_68: Array) -> None:
-    """Fieller's interval for the direction of vectors (2, ...): all directions where they may be zero."""
     direction = directions(vector, covariance, both_ends=name == EITHER_AXIS, of_68=of_68)
     half, low, high = (np.rad2deg(part) / 2 for part in direction)
     value = planes[name]
@@ -166,7 +151,7 @@ def set_ratios(planes: Planes, derived: Mapping[str, Derived], image: ElementNoi
             continue
         middle = value[..., some].astype(float)
         bent, shared = u, np.nan_to_num(np.einsum("...pk,pk->...p", quantity.gradient[..., some, :], of_m00))
-        if name.endswith("_deg"):
+        if name.endswith("_deg") or not np.nan_to_num(quantity.gradient[..., 0]).any():
             # No ratio to m00.
             bent, shared = np.zeros_like(u), np.zeros_like(shared)
         low, high = whole_range(name, middle)
@@ -348,29 +333,6 @@ def set_differential(planes: Planes, is_determined: NDArray[np.bool_]) -> None:
         low, high = whole_range(name, value)
         half = np.where(is_determined, error, np.maximum(value - low, high - value))
         put(planes, name, value, half, *np.where(is_determined, bounds, np.stack([low, high])))
-
-
-def set_dominant(planes: Planes, derived: Mapping[str, Derived], turn: Array, is_determined: NDArray[np.bool_]) -> None:
-    """Every process is in the intervals where the dominant one is not determined. `set_magnitudes` is done."""
-    # For pulls of 1, as m0 has no stored interval: the mean square of a pull grows as at sqrt(3) errors.
-    planes["dominant_mueller_jones_errors"] *= np.sqrt(_turned(turn, np.sqrt(3))).astype(np.float32)
-    for name in ("dominant_diattenuation_circular", "dominant_polarizance_circular"):
-        value, error = planes[name], planes[f"{name}_errors"]
-        half, far = (error * np.sqrt(_turned(turn, deviate)) for deviate in (1.0, NORMAL_95))
-        put(planes, name, value, half, value - NORMAL_95 * far, value + NORMAL_95 * far)
-    if is_determined.all():
-        return
-    for name in [n for n in derived if n.startswith("dominant_")]:
-        value = np.where(is_determined, planes[name], derived[name].value)
-        error = planes[f"{name}_errors"]
-        low, high = (value - 90, value + 90) if name.endswith("_deg") else (0.0 if "_linear" in name else -1.0, 1.0)
-        bounds = planes.get(f"{name}_95", (value - NORMAL_95 * error, value + NORMAL_95 * error))
-        half = np.where(is_determined, error, np.maximum(value - low, high - value))
-        if name == "dominant_mueller_jones":
-            planes[f"{name}_errors"] = np.asarray(half, dtype=np.float32)
-        else:
-            ends = [np.where(is_determined, b, end) for b, end in zip(bounds, (low, high), strict=True)]
-            put(planes, name, value, half, *ends)
 
 
 def put(planes: Planes, name: str, value: Array, error: Array, *ends: Array) -> None:

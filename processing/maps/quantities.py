@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from processing.arrays import RealArray
 from processing.errors import ProcessError
 from processing.maps.coherency_noise import coherency_noise
+from processing.maps.dominant_intervals import set_dominant
 from processing.maps.eigenvalue_intervals import set_eigenvalues, set_entropy, set_symmetric
 from processing.maps.extrapolation import EXTRAPOLATED, ExtrapolatedImage
 from processing.maps.intervals import (
@@ -18,7 +19,6 @@ from processing.maps.intervals import (
     moves_of,
     set_depolarization_power,
     set_differential,
-    set_dominant,
     set_magnitudes,
     set_ratios,
     set_retardance,
@@ -274,7 +274,7 @@ def _set_intervals(
     """Intervals that first order does not give: see `processing.maps.intervals`."""
     error, linear_error = planes["retardance_deg_errors"], planes["retardance_linear_deg_errors"]
     diattenuation_error = planes["diattenuation_errors"]
-    turn: NDArray[np.float64] = np.zeros(())
+    seen = np.full(m.shape[:2], np.inf)
     uneven, components = 1.0, 8.0
     planes["td_missed_noise"] = np.zeros_like(planes["td_missed"])
     planes["valid"] = np.isfinite(planes["td_missed"]).astype(np.uint8)
@@ -287,13 +287,13 @@ def _set_intervals(
         components = block_components(of_depolarizer)
         uneven = np.sqrt(8 / components)
         shrunk = set_eigenvalues(planes, noise, xi0, components)
-        # From the gap without noise. The elements of H have two parts each.
+        # The gap without noise.
         first, second = planes["coherency_eigenvalues"][:2].astype(float)
         seen = (first - second) / (uneven * noise.coupling)
-        turn = np.asarray(2 / np.square(np.maximum(seen, SEEN)))
-    set_magnitudes(planes, derived, m, image, turn=turn, noises={"retardance_deg": retardance})
-    if isinstance(image, MuellerImage):
-        set_dominant(planes, derived, turn, seen > SEEN)
+    of_process = {name for name in derived if name.startswith("dominant_")}
+    others = {name: derived[name] for name in derived if name not in of_process}
+    set_magnitudes(planes, others, m, image, noises={"retardance_deg": retardance})
+    set_dominant(planes, derived, m, image.covariance(), seen=seen)
     weakest = np.abs(_symmetric_eigenvalues(np.nan_to_num(depolarizer[..., 1:, 1:]))).min(axis=0)
     # What is left of the light after the diattenuator carries the noise of all of it.
     passed = 1 - np.square(np.asarray(derived["diattenuation"].value) + diattenuation_error)

@@ -113,6 +113,8 @@ def dominant(m: RealArray) -> dict[str, Derived]:
 
     value = values(np.asarray(m, dtype=float))
     gradient = np.moveaxis(numeric_gradient(values, m), -2, 0)
+    # m00 adds the same to all eigenvalues.
+    gradient[..., 0] = 0
     first_row, first_column = [1, 2, 3], [4, 8, 12]
     shape = (4, 4, *value.shape[:-1])
     matrix = Derived(np.moveaxis(value, -1, 0).reshape(shape), gradient.reshape(*shape, 16))

@@ -135,12 +135,12 @@ def directions(vector: Array, covariance: Array, both_ends: bool = False, of_68:
     xx, yy, xy = np.asarray(covariance, dtype=float)
     determinant = np.maximum(xx * yy - xy**2, 0.0)
     across = np.maximum(x**2 * yy + y**2 * xx - 2 * x * y * xy, 0.0)
-    ends = []
+    value, ends = np.arctan2(y, x), []
     for deviate, limit in ((of_68, ANY_DIRECTION[0] * of_68), (NORMAL_95, ANY_DIRECTION[1])):
         a, d = x**2 - deviate**2 * xx, y**2 - deviate**2 * yy
         p, q = (a - d) / 2, x * y - deviate**2 * xy
         half = np.arctan2(deviate * np.sqrt(np.maximum(across - deviate**2 * determinant, 0.0)), (a + d) / 2) / 2
-        off = np.arctan2(q, p) / 2 - np.arctan2(y, x)
+        off = np.arctan2(q, p) / 2 - value
         off -= np.pi * np.round(off / np.pi)
         everything = across <= (deviate if both_ends else limit) ** 2 * determinant
         whole = np.pi / 2 if both_ends else np.pi

@@ -315,6 +315,23 @@ def test_intervals_of_the_dominant_process_are_not_too_long() -> None:
     assert min(c.in_95 for c in table) > 0.88
 
 
+def test_a_dominant_polarizer_has_no_interval_that_always_covers() -> None:
+    """Noise does not pass a diattenuation of 1: 95 % intervals about the value covered 99.2 and 99.7 %."""
+    found = cells("RGB950's 40", 1, 60, 1000, samples=["polarizer 1:1000"], extra=(), first_seed=9107)
+    table = [c for c in found if c.quantity.startswith("dominant_") and c.quantity.endswith("_linear")]
+    assert len(table) == 2
+    assert all(0.65 < c.in_68 < 0.72 and 0.935 < c.in_95 < 0.985 for c in table), table
+
+
+def test_a_quiet_element_of_the_dominant_process_has_its_own_second_order() -> None:
+    """It had that of the noisiest one: pulls of 0.67 to 0.78, and 95 % intervals covered 99.5 to 99.8 %."""
+    samples = ["non-depolarizing", "air", "retarder 180"]
+    found = cells("two plates of 90 degrees, 5 to 1, 30", 1, 20, 1000, samples=samples, extra=(), first_seed=9107)
+    table = [c for c in found if c.quantity == "dominant_diattenuation_circular"]
+    assert len(table) == 3
+    assert all(c.rms > 0.8 for c in table), table
+
+
 def test_orientations_of_the_dominant_process_have_68_percent_intervals_of_their_own() -> None:
     """With the covariance of the 95 % interval they covered 76 and 79 %."""
     found = cells("24 random states", 4, 20_000, 3000, samples=["det < 0"], extra=())
