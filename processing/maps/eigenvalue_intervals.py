@@ -18,6 +18,11 @@ from processing.storage.products.images import MuellerImage
 #: of a depolarizer.
 PURE = (0.15, 0.45)
 
+#: Part of the noise of a block of three that the largest of four eigenvalues leaves to the others, as noise chooses
+#: it, by its true height over them in units of the noise of an element. docs/studies/error-bars.md has the program.
+CHOSEN = (0.757, 0.787, 0.846, 0.9, 0.937, 0.958, 0.97, 0.981, 0.987, 0.992)
+HEIGHTS = (0, 1, 2, 3, 4, 5, 6, 8, 10, 15)
+
 
 def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, estimate: CorrectedXi0, components: float) -> Array:
     """Noise taken off eigenvalues, which it pushes apart, and off what follows from them.
@@ -62,7 +67,8 @@ def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, estimate: CorrectedX
     missed = planes["td_missed"].astype(float)
     planes["td_missed_noise"] = (missed * np.sqrt(noise.others / observed)).astype(np.float32)
     # Nearly in proportion to the root of their sum of squares, the length of a vector.
-    total = np.square(missed) / observed * noise.others
+    share = np.interp((4 * estimate.xi0 - 1) / (3 * unit), HEIGHTS, CHOSEN)
+    total = np.square(missed) / observed * noise.others * share
     along = np.square(planes["td_missed_errors"].astype(float))
     put(planes, "td_missed", *interval(missed, along, total, total**2 / components))
     return shrunk
