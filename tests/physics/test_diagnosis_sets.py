@@ -92,6 +92,23 @@ def test_any_number_of_causes_is_as_likely_whatever_sentences_there_are():
         assert sets.prior_odds(chosen) == pytest.approx(odds)
 
 
+def test_what_no_data_show_tells_nothing_of_how_many_causes_there_are():
+    """Such groups began as absent, and a chain learnt from them that causes are rare."""
+    gradient = np.array([40.0, -35.0, 50.0, 3.0, 2.0, *np.zeros(9)])
+    curvature = np.diag([90.0, 60.0, 80.0, 6.0, 5.0, *np.zeros(9)])
+    sets = Sets(Quadratic(0.0, gradient, curvature), groups(*[1] * 14), QUIET)
+    every = [np.array(chosen, dtype=bool) for chosen in product([False, True], repeat=14)]
+    factor = np.exp(sets.conditional(sets.empty()).log_factor)
+    weight = np.array([np.exp(sets.log_prior(chosen)) * factor[chosen].prod() for chosen in every])
+    exact = weight @ np.array(every) / weight.sum()
+    samples = stay(sets, likely_starts(sets, likely_set(sets)), 300)
+    assert samples.probability == pytest.approx(exact, abs=0.02)
+    # Three causes of five make the others likely; that is no reason to correct them.
+    assert exact[5:] == pytest.approx(0.65, abs=0.15)
+    assert samples.takes_part[:3].all()
+    assert not samples.takes_part[5:].any()
+
+
 def test_the_chance_of_a_worse_result_is_that_of_all_sets():
     """What no data show is absent or large: that is no normal distribution of a small width."""
     problem = Quadratic(50.0, np.array([-0.35 * 400, 0.0]), np.diag([400.0, 1e-6]))
@@ -145,7 +162,7 @@ def test_what_is_unlikely_one_by_one_is_likely_together():
     size, curvature = 30, 50.0
     gradient = np.sqrt(curvature) * np.random.default_rng(19).normal(0, 1.5, size)
     sets = Sets(Quadratic(0.0, gradient, curvature * np.eye(size)), groups(*[1] * size), QUIET)
-    posterior = stay(sets, likely_starts(sets, sets.empty()), 3000)
+    posterior = stay(sets, likely_starts(sets, sets.empty()), 300)
     # Independent data: sums over all sets of one size are elementary symmetric polynomials of the Bayes factors.
     width = 1 / (curvature + TAU**-2.0)
     factor = np.sqrt(width) / TAU * np.exp(0.5 * gradient[:, None] ** 2 * width)

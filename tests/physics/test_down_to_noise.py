@@ -159,7 +159,7 @@ def test_a_mean_off_the_valley_gives_way_to_the_minimum_near_by(space):
     sets = Sets(form, [Group(np.array([0])), Group(np.array([1]))], Noise(True, 2.0))
     state = State(np.full(2, 3.0))
     fit = sets.fitted(state)
-    samples = SimpleNamespace(mean=fit.mean, covariance=fit.covariance, probability=np.ones(2), best=state)
+    samples = SimpleNamespace(mean=fit.mean, covariance=fit.covariance, takes_part=np.ones(2, dtype=bool), best=state)
     off, on = (problem.sums(space, v).excess.sum() for v in (fit.mean, about))
     assert off > 10 * on
     posterior = _posterior_of(problem, space, ((0,), (1,)), sets, samples=samples, about=about, rivals={})

@@ -20,7 +20,7 @@ from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.range_of import RANK
 from processing.diagnosis.search.result import Check, MuellerError
-from processing.diagnosis.search.rules import CHANCE_WORSE, SMALL, TAKES_PART
+from processing.diagnosis.search.rules import CHANCE_WORSE, SMALL
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import Changes
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
@@ -221,7 +221,7 @@ def _moves_m(posterior: Posterior, k: int, applied: bool) -> bool:
     if applied or not candidate.state_chosen:
         return applied or bool(spread.any())
     group = next(g for g, members in enumerate(posterior.members) if k in members)
-    return bool(posterior.samples.probability[group] > TAKES_PART)
+    return bool(posterior.samples.takes_part[group])
 
 
 def _effects_of(space: Space, direction: Array, size: Array, names: tuple[str, ...]) -> tuple[AppliedEffect, ...]:

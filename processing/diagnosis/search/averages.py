@@ -16,7 +16,7 @@ from scipy.special import expit
 from processing.arrays import Array
 from processing.diagnosis.search.likely_set import PATIENCE, climb
 from processing.diagnosis.search.range_of import NEARLY_ZERO
-from processing.diagnosis.search.rules import ALTERNATIVE, SURE
+from processing.diagnosis.search.rules import ALTERNATIVE, SURE, TAKES_PART
 from processing.diagnosis.search.sets import Conditional, SetFit, Sets, State
 
 
@@ -27,18 +27,26 @@ class Samples:
     Attributes
     ----------
     probability : (G,) of each group to be there; mean (K,), covariance (K, K) of the parameters in typical sizes.
+    supported : (G,) of each group to be there with a Bayes factor above one; any_supported : of one of them at least.
     sets : (S, G) which groups were there; weight : (S,), sum 1.
     fits : the sets with a share that counts, each with that share (sum 1).
     best : the most likely set.
     """
 
     probability: Array
+    supported: Array
+    any_supported: float
     mean: Array
     covariance: Array
     sets: NDArray[np.bool_]
     weight: Array
     fits: tuple[tuple[float, SetFit], ...]
     best: State
+
+    @property
+    def takes_part(self) -> NDArray[np.bool_]:
+        """Groups (G,) that are fitted and corrected: likely enough, and mostly supported where they are there."""
+        return (self.probability > TAKES_PART) & (self.supported > self.probability / 2)
 
     def any_of(self, members: Sequence[int]) -> float:
         """Probability that at least one of some groups is there."""
@@ -54,9 +62,9 @@ class Samples:
         return share, mean, np.sqrt(np.maximum(variance, 0.0))
 
 
-def chance_of(sets: Sets, c: Conditional) -> Array:
+def chance_of(sets: Sets, c: Conditional, state: State) -> Array:
     """Probability (G,) of each group given the others."""
-    return np.where(sets.free, expit(c.log_odds), 1.0)
+    return np.where(sets.free, expit(sets.learnt_odds(c, state.tau > 0)), 1.0)
 
 
 def swap_groups(sets: Sets, state: State) -> Iterator[State]:
@@ -92,7 +100,7 @@ class _ByStay:
         key = _key(state)
         if key not in self._known:
             c = self._sets.conditional(state)
-            self._known[key] = c, chance_of(self._sets, c)
+            self._known[key] = c, chance_of(self._sets, c, state)
             if self.best is None or c.score > self.best[0]:
                 self.best = c.score, state.copy()
         return self._known[key]
@@ -133,17 +141,20 @@ class _ByStay:
         likely = {key: stays for key, stays in self._seen.items() if stays > NEARLY_ZERO * sum(self._seen.values())}
         return tuple((stays / sum(likely.values()), self._known[key][0]) for key, stays in likely.items())
 
-    def moments(self) -> tuple[Array, Array, Array]:
-        """Probability (G,) of each group; mean (K,) and covariance (K, K) of the parameters."""
+    def moments(self) -> tuple[Array, Array, float, Array, Array]:
+        """Probability (G,) of each group, with support, and of any; mean (K,), covariance (K, K) of values."""
         sets, total = self._sets, sum(self._seen.values())
-        probability, mean, second = np.zeros(len(sets.groups)), np.zeros(sets.size), np.zeros((sets.size, sets.size))
+        (probability, supported), of_any = np.zeros((2, len(sets.groups))), 0.0
+        mean, second = np.zeros(sets.size), np.zeros((sets.size, sets.size))
         for key, stays in self._seen.items():
             (c, chance), weight = self._known[key], stays / total
             probability += weight * chance
+            supported += weight * chance * (c.log_factor > 0)
+            of_any += weight * bool(np.any(sets.free & (c.log_factor > 0) & (np.frombuffer(key)[1:] > 0)))
             if weight > NEARLY_ZERO:
                 mean[c.active] += weight * c.mean
                 second[np.ix_(c.active, c.active)] += weight * (c.covariance + np.outer(c.mean, c.mean))
-        return probability, mean, second - np.outer(mean, mean)
+        return probability, supported, of_any, mean, second - np.outer(mean, mean)
 
     def inclusion(self) -> tuple[NDArray[np.bool_], Array]:
         """Groups (S, G) of each set, and the weight (S,) of the set."""

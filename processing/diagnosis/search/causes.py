@@ -70,7 +70,8 @@ def causes(posterior: Posterior, chi2: float) -> tuple[Cause, ...]:
     result = []
     for k in posterior.free_groups:
         # Odds of every group as the replacement of this one, its own included.
-        given_others = posterior.sets.conditional(posterior.sets.without(state, k))
+        others = posterior.sets.without(state, k)
+        given_others = posterior.sets.conditional(others)
         odds = given_others.log_odds
         forgiven = forgiven_misfit(given_others.fit_gain, k, chi2 / state.unit)
         rivals = posterior.sets.free & (state.tau == 0) & (odds > max(odds[k] - LEAST_DIFFERENCE, 0.0) - forgiven)
@@ -78,10 +79,11 @@ def causes(posterior: Posterior, chi2: float) -> tuple[Cause, ...]:
         alternatives += [j for j in posterior.rivals.get(k, ()) if j not in alternatives]
         parts = [posterior.space.slices[m] for m in posterior.members[k]]
         # The effect can be certain while the state from which it acts is open.
-        of_family = (j for j in range(len(posterior.members)) if posterior.label(j).family == posterior.label(k).family)
+        supported = np.flatnonzero(given_others.log_factor > 0).tolist()
+        of_family = (j for j in supported if posterior.label(j).family == posterior.label(k).family)
         members = list(dict.fromkeys([k, *alternatives, *of_family]))
         # The visited sets, and the odds given the likeliest set, are both too confident.
-        total = float(np.logaddexp.reduce(odds[members]))
+        total = float(np.logaddexp.reduce(posterior.sets.learnt_odds(given_others, others.tau > 0)[members]))
         result.append(
             Cause(
                 candidates=tuple(posterior.space.candidates[m] for m in posterior.members[k]),

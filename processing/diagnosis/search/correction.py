@@ -9,7 +9,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import Fit, Solution, held_out, minimize
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import LIKELY, LITTLE, SLACK, SURE, TAKES_PART
+from processing.diagnosis.search.rules import LIKELY, LITTLE, SLACK, SURE
 from processing.diagnosis.search.space import Problem, Space
 
 
@@ -37,14 +37,15 @@ def _least_needed(posterior: Posterior, keep: Collection[Candidate]) -> list[int
     fit only together.
     """
     space, form = posterior.space, posterior.sets.form
-    order = np.argsort(-posterior.samples.probability)
+    samples = posterior.samples
+    order = np.lexsort((-samples.probability, ~samples.takes_part))
     is_used = np.concatenate([np.zeros(0, dtype=bool), *(np.full(c.size, c in keep) for c in space.candidates)])
     mean = posterior.values / space.joined("typical")
     chi2_at_mean = form.at(mean)
     groups: list[int] = []
     for g in order:
         loss = form.at(np.where(is_used, mean, 0.0)) - chi2_at_mean
-        if posterior.samples.probability[g] <= TAKES_PART and loss <= SLACK**2 * posterior.samples.best.unit:
+        if not samples.takes_part[g] and loss <= SLACK**2 * samples.best.unit:
             break
         groups.append(int(g))
         for m in posterior.members[g]:

@@ -11,7 +11,7 @@ from processing.arrays import Array
 from processing.diagnosis.search.averages import Samples, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import minimize
-from processing.diagnosis.search.rules import CHANGES_BEFORE, EXACT, LITTLE, NOMINAL_TAU, ROUNDS, TAKES_PART
+from processing.diagnosis.search.rules import CHANGES_BEFORE, EXACT, LITTLE, NOMINAL_TAU, ROUNDS
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Problem, Space
 
@@ -70,7 +70,7 @@ def descend(
 
     The descent begins at the best of some places (K,).
     """
-    part, positions = _part_of(space, [g for g, p in zip(groups, samples.probability, strict=True) if p > TAKES_PART])
+    part, positions = _part_of(space, [g for g, on in zip(groups, samples.takes_part, strict=True) if on])
     typical = space.joined("typical")[positions]
     width = np.sqrt(np.diag(samples.covariance) + samples.mean**2)[positions] * typical
     weak = samples.best.unit / np.maximum(width, LITTLE * typical) ** 2

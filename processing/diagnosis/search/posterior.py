@@ -68,8 +68,8 @@ class Posterior:
 
     @property
     def any_cause(self) -> bool:
-        """Whether some group is there for sure, be it that none is by itself."""
-        return self.samples.any_of(np.flatnonzero(self.sets.free).tolist()) >= SURE
+        """Whether some group that the data support is there for sure, be it that none is by itself."""
+        return self.samples.any_supported >= SURE
 
     @property
     def free_groups(self) -> list[int]:

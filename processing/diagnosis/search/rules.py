@@ -159,4 +159,4 @@ KEPT = 1024
 #: [changes] Of a chain in the last round.
 CHANGES = 300
 #: [changes] The same in the rounds before.
-CHANGES_BEFORE = 80
+CHANGES_BEFORE = 30

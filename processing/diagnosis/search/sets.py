@@ -123,9 +123,11 @@ class SetFit:
 class Conditional(SetFit):
     """The same, with the conditional posterior of every group: log odds (G,), and weights (G, T) of each tau.
 
-    `fit_gain` (G,): the part of the log odds that a better fit gives; the prior takes the rest.
+    `log_factor` (G,): log Bayes factor of the group, which is the log odds without the prior of the set; `fit_gain`
+    (G,): the part of it that a better fit gives.
     """
 
+    log_factor: Array
     log_odds: Array
     tau_weights: Array
     fit_gain: Array
@@ -204,8 +206,28 @@ class Sets:
             - np.logaddexp.reduce(at_rates - own + self._log_absent)
             for own in (self._log_absent, self._log_present)
         )
-        beside = np.where(self.alone, (is_included & self.alone).sum() - (is_included & self.alone), 0.0)
-        return np.asarray(np.where(is_included, of_present[self._weight], of_absent[self._weight]) + NEVER * beside)
+        return np.asarray(np.where(is_included, of_present[self._weight], of_absent[self._weight])) + self._barred(
+            is_included
+        )
+
+    def learnt_odds(self, c: Conditional, is_included: NDArray[np.bool_]) -> Array:
+        """Log odds (G,) of each group to be there, the presence of all others summed over at each rate.
+
+        Whether a group is there that no data show tells nothing of the rate. With independent data it is exact.
+        """
+        factor = np.where(self.free, c.log_factor, 0.0)
+        log_present, log_absent = (part[:, self._weight] for part in (self._log_present, self._log_absent))
+        each = np.logaddexp(log_absent, log_present + factor)
+        others = np.log(WEIGHTS)[:, None] + each.sum(axis=1, keepdims=True) - each
+        at_rates = np.exp(others - others.max(axis=0))
+        present, absent = (np.sum(at_rates * np.exp(part), axis=0) for part in (log_present, log_absent))
+        prior = np.log(present / absent)
+        return np.where(self.free, c.log_factor + prior + self._barred(is_included), np.inf)
+
+    def _barred(self, is_included: NDArray[np.bool_]) -> Array:
+        """Log odds (G,) of groups beside which no other may be there."""
+        beside = (is_included & self.alone).sum() - (is_included & self.alone)
+        return np.asarray(NEVER * np.where(self.alone, beside, 0.0))
 
     def fitted(self, state: State) -> SetFit:
         """Posterior of the parameters that are there."""
@@ -247,7 +269,7 @@ class Sets:
         With `follow` the unit is that which a group leaves, where it is not there yet.
         """
         fit, inverse, right = self._solved(state)
-        log_odds, fit_gain = np.full(len(self.groups), np.inf), np.zeros(len(self.groups))
+        log_factor, fit_gain = np.full(len(self.groups), np.inf), np.zeros(len(self.groups))
         weights, now = np.zeros((len(self.groups), self.taus.size)), self.noise.log_likelihood(fit.excess)
         for members, s, q in self._cavities(state, fit, inverse, right):
             value, along = _along_axes(s, q)
@@ -268,10 +290,12 @@ class Sets:
             total = share.sum(axis=1, keepdims=True)
             weights[members[:, None], kept] = share / total
             fit_gain[members] = 0.5 * np.sum(explained * share / total, axis=1)
-            log_odds[members] = (top + np.log(total))[:, 0]
+            log_factor[members] = (top + np.log(total))[:, 0]
         is_included = (state.tau > 0) & self.free
-        log_odds = np.where(self.free, log_odds + self.prior_odds(is_included), np.inf)
-        return Conditional(**vars(fit), log_odds=log_odds, tau_weights=weights, fit_gain=fit_gain)
+        log_odds = np.where(self.free, log_factor + self.prior_odds(is_included), np.inf)
+        return Conditional(
+            **vars(fit), log_factor=log_factor, log_odds=log_odds, tau_weights=weights, fit_gain=fit_gain
+        )
 
     def _cavities(
         self, state: State, fit: SetFit, inverse: Array, right: Array
