@@ -104,7 +104,7 @@ def test_what_no_data_show_tells_nothing_of_how_many_causes_there_are():
     samples = stay(sets, likely_starts(sets, likely_set(sets)), 300)
     assert samples.probability == pytest.approx(exact, abs=0.02)
     # Three causes of five make the others likely; that is no reason to correct them.
-    assert exact[5:] == pytest.approx(0.65, abs=0.15)
+    assert exact[5:].min() > 0.7
     assert samples.takes_part[:3].all()
     assert not samples.takes_part[5:].any()
 

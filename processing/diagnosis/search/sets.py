@@ -123,8 +123,9 @@ class SetFit:
 class Conditional(SetFit):
     """The same, with the conditional posterior of every group: log odds (G,), and weights (G, T) of each tau.
 
-    `log_factor` (G,): log Bayes factor of the group, which is the log odds without the prior of the set; `fit_gain`
-    (G,): the part of it that a better fit gives.
+    The odds are those of the set, as the search compares sets; averages take `Sets.learnt_odds`. `log_factor` (G,): log
+    Bayes factor of the group, which is the log odds without the prior of the set; `fit_gain` (G,): the part of it that
+    a better fit gives.
     """
 
     log_factor: Array
