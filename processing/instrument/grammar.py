@@ -34,7 +34,7 @@ FEWEST_STATES = 7
 TIMES = ("over time", "settling", "warming")
 #: [modes] Of what wanders: half a period to so many halves in a capture; faster waves have a frequency.
 MODES = 12
-#: Sites without a zero of their own: what they do is told from the mean over the capture.
+#: Sites without a zero of their own: M holds for the first state of a capture, and for the mean over waves of an axis.
 WITHOUT_ZERO = ("sample", "image")
 #: Quantities that a plate that turns may have.
 OF_A_PLATE = (
@@ -145,7 +145,8 @@ class Sentence:
         """Add the sentence with these values to the changes."""
         courses = course(self.course, changes.conditions)
         if self.site in WITHOUT_ZERO:
-            courses = courses - courses.mean(axis=1, keepdims=True)
+            zero = courses[:, :1] if self.of_one_capture else courses.mean(axis=1, keepdims=True)
+            courses = courses - zero
         parts = values.reshape(len(self.quantities), -1) @ courses
         for quantity, part in zip(self.quantities, parts, strict=True):
             _add(changes, model, self.site, quantity, part=part)

@@ -247,7 +247,7 @@ def saturation(bench: TrueBench, random: np.random.Generator, states: int, sizes
 
 def image_drift(bench: TrueBench, random: np.random.Generator, states: int, sizes: Sizes = (0.1, 1.0)) -> Truth:
     x, y = draw_signed(random, *sizes), draw_signed(random, *sizes)
-    bench.shift.append(lambda k, a: (x * (k / (states - 1) - 0.5), y * (k / (states - 1) - 0.5)))
+    bench.shift.append(lambda k, a: (x * k / (states - 1), y * k / (states - 1)))
     return Truth("image_drift", "", {"x": x, "y": y})
 
 

@@ -168,7 +168,7 @@ def test_a_second_effect_beside_a_retardance_that_varies_over_the_image(configs,
     bench = TrueBench(rows=40, columns=40)
     x = np.linspace(-1, 1, 40)
     bench.field_retardance = np.deg2rad(np.broadcast_to(1.5 * x, (40, 40)))
-    bench.shift.append(lambda k, a: (0.8 * (k / (STATES - 1) - 0.5), 0.0))
+    bench.shift.append(lambda k, a: (0.8 * k / (STATES - 1), 0.0))
     diagnosis = diagnosed(capture(tmp_path, configs, bench, air=True), configs)
     assert diagnosis.verdict == "explained"
     by_kind = {e.kind: e for e in diagnosis.effects}
@@ -184,7 +184,7 @@ def test_shifts_on_a_mosaic_are_told_in_pixels_of_the_sensor(configs, tmp_path):
     random, nm = np.random.default_rng(3), 662.0
     model = InstrumentModel.load(file)
     bench = declared_bench(model.at(nm), nm, 64, mosaic=True, electrons=20_000.0)
-    bench.shift.append(lambda k, a: (1.2 * (k / 15 - 0.5), -0.7 * (k / 15 - 0.5)))
+    bench.shift.append(lambda k, a: (1.2 * k / 15, -0.7 * k / 15))
     angles = {"psg": state_angles(16, True, False)["psg"]}
     counts = digitize(bench, expose(bench, TrueScene(random), angles), random)
     path = tmp_path / "capture.h5"

@@ -17,11 +17,11 @@ class ImageDrift(ImageShift, OfOneCapture):
     """Pixels from the first to the last state, x to the right and y down."""
 
     belongs_to = "capture"
-    reference = "the image stands where it was in the middle of the capture"
+    reference = "the image stands where it was in the first state"
     fixed_parameters = tuple(Parameter(n, "pixel", -5, 5, 0.2) for n in ("x", "y"))
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if conditions.states > 1 else ()
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
-        changes.shift_px = changes.shift_px + changes.conditions.elapsed[:, None] * values
+        changes.shift_px = changes.shift_px + (changes.conditions.elapsed[:, None] + 0.5) * values
