@@ -10,6 +10,7 @@ from scipy.special import betaln
 from processing.diagnosis.search.averages import likely_starts, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
+from processing.diagnosis.search.correction import most_needed
 from processing.diagnosis.search.decision import predicted_change
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.likely_set import likely_set
@@ -306,3 +307,15 @@ def test_the_state_that_a_slip_begins_at_is_one_of_those_that_the_data_leave_ope
 
 def slipped(first):
     return Candidate(RotationSlip(), f"psg@{first}", (Parameter("slip", "degree", -45, 45, 1.0),), 0)
+
+
+def test_a_correction_has_the_groups_that_it_needs_and_no_more():
+    """In order of probability it took up to 300 groups, and an instrument file cannot hold so many."""
+    random = np.random.default_rng(5)
+    quadratic = form(random.standard_normal((60, 30)), np.zeros(30))
+    mean = np.where(np.arange(30) < 3, 2.0, 0.01 * random.standard_normal(30))
+    quadratic = Quadratic(quadratic.excess, -quadratic.curvature @ mean, quadratic.curvature)
+    index = [np.array([k]) for k in range(30)][::-1]
+    used = np.arange(30) == 0
+    assert sorted(most_needed(quadratic, mean, index, is_used=used, most=4.0)) == [27, 28]
+    assert sorted(most_needed(quadratic, mean, index, is_used=used, most=0.0)) == list(range(29))

@@ -1,8 +1,9 @@
 """The correction of a posterior: the mean of the groups that are likely enough, and its predictions."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
@@ -10,6 +11,7 @@ from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import Fit, Solution, held_out, minimize
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import LIKELY, LITTLE, SLACK, SURE
+from processing.diagnosis.search.sets import Quadratic
 from processing.diagnosis.search.space import Problem, Space
 
 
@@ -31,25 +33,38 @@ def applied(posterior: Posterior, base: Space, unfit: Collection[Candidate] = ()
 
 
 def _least_needed(posterior: Posterior, keep: Collection[Candidate]) -> list[int]:
-    """Groups in addition to `keep` that are likely enough, and further groups without which the fit gets worse.
+    """Groups in addition to `keep` that are likely enough, and further groups without which the fit gets worse."""
+    space, samples = posterior.space, posterior.samples
+    likely = np.flatnonzero(samples.takes_part)
+    index = [space.positions(members) for members in posterior.members]
+    is_used = np.concatenate([np.zeros(0, dtype=bool), *(np.full(c.size, c in keep) for c in space.candidates)])
+    for g in likely:
+        is_used[index[g]] = True
+    mean = posterior.values / space.joined("typical")
+    most = SLACK**2 * samples.best.unit
+    return [*likely.tolist(), *most_needed(posterior.sets.form, mean, index, is_used=is_used, most=most)]
+
+
+def most_needed(
+    form: Quadratic, mean: Array, index: Sequence[NDArray[np.int64]], *, is_used: Array, most: float
+) -> list[int]:
+    """Groups that a correction by a mean (K,) needs, so that chi-square is within `most` of that at the mean.
 
     Several groups that are unlikely one by one can be one cause together: the mean has a part of each, and these parts
-    fit only together.
+    fit only together. The group that takes most away comes first. `index` holds the values of each group, and `is_used`
+    (K,) those that are corrected already.
     """
-    space, form = posterior.space, posterior.sets.form
-    samples = posterior.samples
-    order = np.lexsort((-samples.probability, ~samples.takes_part))
-    is_used = np.concatenate([np.zeros(0, dtype=bool), *(np.full(c.size, c in keep) for c in space.candidates)])
-    mean = posterior.values / space.joined("typical")
-    chi2_at_mean = form.at(mean)
+    own = np.array([mean[i] @ form.curvature[np.ix_(i, i)] @ mean[i] for i in index])
+    own[[bool(is_used[i].all()) for i in index]] = np.inf
+    x, chi2_at_mean = np.where(is_used, mean, 0.0), form.at(mean)
     groups: list[int] = []
-    for g in order:
-        loss = form.at(np.where(is_used, mean, 0.0)) - chi2_at_mean
-        if not samples.takes_part[g] and loss <= SLACK**2 * samples.best.unit:
+    for _ in index:
+        if form.at(x) - chi2_at_mean <= most:
             break
-        groups.append(int(g))
-        for m in posterior.members[g]:
-            is_used[space.slices[m]] = True
+        slope = 2 * (form.gradient + form.curvature @ x) * mean
+        g = int(np.argmin(own + [float(slope[i].sum()) for i in index]))
+        groups.append(g)
+        x[index[g]], own[g] = mean[index[g]], np.inf
     return groups
 
 
