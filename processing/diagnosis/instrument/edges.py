@@ -15,7 +15,7 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.instrument.features import inside
 from processing.diagnosis.instrument.pixel_sums import Pixels
-from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.problem import InstrumentProblem, about_mean
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.rules import FEWEST_PIXELS, LIMIT
@@ -78,7 +78,7 @@ def _of_capture(
     acting = [[c for c in group if c.acts(k, data.wavelength_nm)] for group in shifts]
     without = _values_without(space, values, [c for group in acting for c in group])
     changes = problem.changes(k, space, without)
-    rest_px = changes.shift_px / data.pitch
+    rest_px = about_mean(changes.shift_px) / data.pitch
     rows, sigma, use = data.values_per_pixel, moments.sigma.astype(np.float32)[:, None, None], moments.counts
     images = data.moved_back(rest_px + problem.own_px[k]).signal.reshape(rows, *edge.shape) / sigma
     q = range_of(problem.columns(k, changes) * use[:, None]).astype(np.float32)
@@ -93,7 +93,7 @@ def _of_capture(
         if not group:
             continue
         own_values = _values_without(space, values, [c for each in acting if each is not group for c in each])
-        own_px = problem.changes(k, space, own_values).shift_px / data.pitch - rest_px
+        own_px = about_mean(problem.changes(k, space, own_values).shift_px) / data.pitch - rest_px
         frames = (fitted * sigma).reshape(data.signal.shape)
         moved = replace(data, signal=frames, true_variance=None).moved_back(-own_px).signal
         change = moved.reshape(images.shape)[:, edge] / sigma[:, :, 0] - fitted[:, edge]

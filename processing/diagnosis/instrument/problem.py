@@ -64,7 +64,7 @@ class InstrumentProblem:
         # The captures as taken (corrected already if they were moved back), and how far the model says that they moved.
         self.still = tuple(captures)
         pairs = zip(self.models, captures, strict=True)
-        shifts = (changes_of(m, c.conditions, c.name).shift_px / c.pitch for m, c in pairs)
+        shifts = (about_mean(changes_of(m, c.conditions, c.name).shift_px / c.pitch) for m, c in pairs)
         self.own_px = tuple(s if movable(s) else np.zeros_like(s) for s in shifts)
         self.captures = self.still if moved_back else _moved_back(self.still, self.own_px)
         self.folds = folds or folds_of(self.captures)
@@ -159,7 +159,7 @@ class InstrumentProblem:
         for candidate, values in undone.items():
             if candidate.moves_image and candidate.acts(capture, self.wavelengths_nm[capture]):
                 candidate.apply(changes, self.models[capture], values)
-        return changes.shift_px / self.captures[capture].pitch
+        return about_mean(changes.shift_px / self.captures[capture].pitch)
 
     def forget_linearizations(self) -> None:
         """Drop what was built for another model or other states; the moments of the counts stay."""
@@ -306,13 +306,14 @@ class InstrumentProblem:
         c[0] = 1.0
         for name, value in changes.response.items():
             c[FEATURES.index(name)] += np.ravel(value)
-        # What shift and blur took away, to second order, from derivatives of the fitted image (which has neither).
+        # What shift and blur took away, to second order, from derivatives of the fitted image, at the mean of the shifts.
         pitch = self.captures[capture].pitch
-        x, y = np.repeat(changes.shift_px / pitch, channels, axis=0).T
+        shift_px = np.repeat(changes.shift_px / pitch, channels, axis=0)
+        (x, y), (u, v), (mean_x, mean_y) = shift_px.T, about_mean(shift_px).T, shift_px.mean(axis=0)
         b = np.repeat(changes.blur_px2 / pitch**2, channels)
         for name, value in (
-            *(("dx", x), ("dy", y), ("dxy", -x * y)),
-            *(("dxx", -(x * x + b) / 2), ("dyy", -(y * y + b) / 2)),
+            *(("dx", x), ("dy", y), ("dxy", mean_x * mean_y - u * v)),
+            *(("dxx", (mean_x**2 - u * u - b) / 2), ("dyy", (mean_y**2 - v * v - b) / 2)),
         ):
             c[FEATURES.index(name)] = value
         return c
@@ -445,6 +446,11 @@ class InstrumentProblem:
             )
         for each in tiles:
             add_tiles(data, moments, each, a, c=c, slopes=slopes, out=out, apart=self._rows_apart(k))
+
+
+def about_mean(shift_px: Array) -> Array:
+    """Shifts (N, 2) from their mean, which the image of an unknown sample takes up: so frames are moved the least."""
+    return np.asarray(shift_px - shift_px.mean(axis=0))
 
 
 def _moved_back(captures: Sequence[CaptureData], shifts_px: Sequence[Array]) -> tuple[CaptureData, ...]:
