@@ -10,7 +10,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import Fit, Solution, held_out, minimize
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import LIKELY, LITTLE, SLACK, SURE
+from processing.diagnosis.search.rules import LIKELY, LITTLE, SURE
 from processing.diagnosis.search.sets import Quadratic
 from processing.diagnosis.search.space import Problem, Space
 
@@ -41,8 +41,8 @@ def _least_needed(posterior: Posterior, keep: Collection[Candidate]) -> list[int
     for g in likely:
         is_used[index[g]] = True
     mean = posterior.values / space.joined("typical")
-    most = SLACK**2 * samples.best.unit
-    return [*likely.tolist(), *most_needed(posterior.sets.form, mean, index, is_used=is_used, most=most)]
+    needed = most_needed(posterior.sets.form, mean, index, is_used=is_used, most=samples.best.unit)
+    return [*likely.tolist(), *needed]
 
 
 def most_needed(
