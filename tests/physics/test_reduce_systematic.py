@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from bench_capture import bench_capture
 
+from processing.diagnosis.instrument.diagnose import diagnose_captures
+from processing.diagnosis.instrument_file import write_instrument
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel, SystematicError
 from processing.reduction.mueller import reduce_mueller
 from processing.reduction.stokes import reduce_stokes
@@ -49,6 +51,24 @@ def test_the_error_is_what_one_standard_deviation_does(air, configs, tmp_path):
     assert error[0, 0] == 0
     assert error / m[0, 0] == pytest.approx(wrong, abs=0.002)
     assert wrong.max() > 0.01
+
+
+@pytest.mark.parametrize("lasting", [True, False])
+def test_a_correction_for_one_capture_alone_is_open_in_the_next_one(lasting, air, configs, tmp_path, monkeypatch):
+    """It was in no error bar: M of the next capture was wrong by 35 of them."""
+    file = configs / "instruments/rgb950.yaml"
+    monkeypatch.setattr("processing.diagnosis.instrument.diagnose.lasts", lambda *_: lasting)
+    judged, _ = diagnose_captures([air], InstrumentModel.load(file))
+    write_instrument(tmp_path / "new.yaml", InstrumentModel.load(file), judged.diagnosis)
+    corrected = InstrumentModel.load(tmp_path / "new.yaml")
+    bench = TrueBench(rows=16, columns=16, dg=np.deg2rad(128.12))
+    later = bench_capture(tmp_path / "next", file, bench, air=True, seed=3).rename(tmp_path / "later.h5")
+    for path, is_corrected in ((air, True), (later, lasting)):
+        product = reduced(path, corrected, path.with_suffix(".m.h5"))
+        m, error = (product[name].mean(axis=(2, 3)) for name in ("mueller", "mueller_systematic"))
+        wrong, error = np.abs(m / m[0, 0] - np.eye(4)).max(), error.max() / m[0, 0]
+        assert wrong < 0.002 if is_corrected else wrong > 0.01
+        assert error == pytest.approx(0.0 if is_corrected else wrong, abs=0.002)
 
 
 def test_two_directions_add_in_squares_and_other_wavelengths_have_none(air, configs, tmp_path):

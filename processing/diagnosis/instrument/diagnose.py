@@ -122,7 +122,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
             unseen=unseen,
             calibrated=calibrated(problem, posterior, final),
             lasts=lasting,
-            uncertain=errors.uncertain(problem, final) if is_known else None,
+            uncertain=errors.uncertain(problem, final, lasting=lasting) if is_known else None,
         ),
         wiring=judgement.first,
         branch=bench.branch,

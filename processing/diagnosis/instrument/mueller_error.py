@@ -149,10 +149,12 @@ class MuellerErrors:
         along = None if self.along is None else partial(_along_some, self.along, index, size)
         return predicted_change(correction[index], self.values[index], covariance, products, along=along)
 
-    def uncertain(self, problem: InstrumentProblem, used: Solution) -> tuple[SystematicError, MuellerError] | None:
+    def uncertain(
+        self, problem: InstrumentProblem, used: Solution, *, lasting: bool = True
+    ) -> tuple[SystematicError, MuellerError] | None:
         """Remaining uncertainty of M/m00 about the applied values, as a file stores it and as the answer reports it.
 
-        None where nothing does.
+        None where nothing does. A correction that is not `lasting` is uncertain as a whole in later captures.
         """
         missed = self.values - self.corrected_values(used)
         covariance = self.covariance + np.outer(missed, missed)
@@ -169,17 +171,22 @@ class MuellerErrors:
         several = len(set(problem.wavelengths_nm)) > 1
         slopes = np.sqrt(np.maximum(np.diag(products), 0.0))
         rms = float(np.sqrt(of_elements.sum() / 15))
-        stored = SystematicError(
-            directions=tuple(
-                _effects_of(self.space, d, slopes * np.abs(d), names) for d in directions.T[: min(enough, MOST_STORED)]
-            ),
+        stored = [_effects_of(self.space, d, slopes * np.abs(d), names) for d in directions.T[: min(enough, MOST_STORED)]]
+        not_applied = np.where(lasts, self.corrected_values(used), 0.0)
+        if not lasting and not_applied.any():
+            # In later captures; the same with the other sign cancels it in these.
+            both = [_effects_of(self.space, v, slopes * np.abs(v), names) for v in (not_applied, -not_applied)]
+            here = (e.model_copy(update={"scope": "capture", "captures": names}) for e in both[1])
+            stored.insert(0, (*both[0], *here))
+        error = SystematicError(
+            directions=tuple(stored),
             rms_over_m00=rms,
             wavelength_nm=None if several else problem.wavelengths_nm[0],
         )
         alone = [float(np.sum((covariance * largest)[p, p])) for p in self.space.slices]
         most = self.space.candidates[int(np.argmax(alone))].short
         elements = tuple(map(float, np.sqrt(np.maximum(of_elements, 0.0))))
-        return stored, MuellerError(elements=elements, rms=rms, most=most)
+        return error, MuellerError(elements=elements, rms=rms, most=most)
 
 
 def _along_some(along: Along, index: NDArray[np.int64], size: int, weights: Array) -> tuple[Array, Array, Array]:
