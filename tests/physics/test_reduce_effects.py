@@ -141,7 +141,7 @@ def test_a_moving_image_is_moved_back(rgb950: InstrumentModel, synthetic_capture
     y, x = np.indices(SHAPE).astype(float)
     frames = np.empty((40, 1, *SHAPE))
     for n in range(40):
-        # M is that of the first state. The scene stands 1.6 pixels further right and 0.8 further up at the end than at the start.
+        # The scene stands 1.6 pixels further right and 0.8 further up at the end than at the start, where M holds.
         yy, xx = (y + 0.8 * elapsed[n]) / 12, (x - 1.6 * elapsed[n]) / 12
         level = 4000 * (1 + 0.2 * np.sin(xx) * np.cos(yy))
         frames[n, 0] = level * (w[n, 0] @ (truth / truth[0, 0]).reshape(16, *SHAPE)[:, 0, 0]) * truth[0, 0, 0, 0] / 4000

@@ -171,13 +171,13 @@ class MuellerErrors:
         several = len(set(problem.wavelengths_nm)) > 1
         slopes = np.sqrt(np.maximum(np.diag(products), 0.0))
         rms = float(np.sqrt(of_elements.sum() / 15))
-        stored = [_effects_of(self.space, d, slopes * np.abs(d), names) for d in directions.T[: min(enough, MOST_STORED)]]
+        effects_of = partial(_effects_of, self.space, slopes, names)
+        stored = [effects_of(d) for d in directions.T[: min(enough, MOST_STORED)]]
         not_applied = np.where(lasts, self.corrected_values(used), 0.0)
         if not lasting and not_applied.any():
             # In later captures; the same with the other sign cancels it in these.
-            both = [_effects_of(self.space, v, slopes * np.abs(v), names) for v in (not_applied, -not_applied)]
-            here = (e.model_copy(update={"scope": "capture", "captures": names}) for e in both[1])
-            stored.insert(0, (*both[0], *here))
+            here = (e.model_copy(update={"scope": "capture", "captures": names}) for e in effects_of(-not_applied))
+            stored.insert(0, (*effects_of(not_applied), *here))
         error = SystematicError(
             directions=tuple(stored),
             rms_over_m00=rms,
@@ -231,8 +231,9 @@ def _moves_m(posterior: Posterior, k: int, applied: bool) -> bool:
     return bool(posterior.samples.takes_part[group])
 
 
-def _effects_of(space: Space, direction: Array, size: Array, names: tuple[str, ...]) -> tuple[AppliedEffect, ...]:
-    effects = []
+def _effects_of(space: Space, slopes: Array, names: tuple[str, ...], direction: Array) -> tuple[AppliedEffect, ...]:
+    """Effects of a direction (K,), without those that M hardly notices, in the captures of these names."""
+    effects, size = [], slopes * np.abs(direction)
     for candidate, part in space.pairs:
         if size[part].max() <= SMALL * size.max():
             continue

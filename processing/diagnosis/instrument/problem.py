@@ -306,7 +306,7 @@ class InstrumentProblem:
         c[0] = 1.0
         for name, value in changes.response.items():
             c[FEATURES.index(name)] += np.ravel(value)
-        # What shift and blur took away, to second order, from derivatives of the fitted image, at the mean of the shifts.
+        # What shift and blur took away, to second order, from derivatives of the fitted image at the mean shift.
         pitch = self.captures[capture].pitch
         shift_px = np.repeat(changes.shift_px / pitch, channels, axis=0)
         (x, y), (u, v), (mean_x, mean_y) = shift_px.T, about_mean(shift_px).T, shift_px.mean(axis=0)
