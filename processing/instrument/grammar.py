@@ -34,7 +34,7 @@ FEWEST_STATES = 7
 TIMES = ("over time", "settling", "warming")
 #: [modes] Of what wanders: half a period to so many halves in a capture; faster waves have a frequency.
 MODES = 12
-#: Sites without a zero of their own: M holds for the first state of a capture, and for the mean over waves of an axis.
+#: Sites without a zero of their own: M is the mean of a sample that changes, where the image stood in the first state.
 WITHOUT_ZERO = ("sample", "image")
 #: Quantities that a plate that turns may have.
 OF_A_PLATE = (
@@ -145,8 +145,8 @@ class Sentence:
         """Add the sentence with these values to the changes."""
         courses = course(self.course, changes.conditions)
         if self.site in WITHOUT_ZERO:
-            zero = courses[:, :1] if self.of_one_capture else courses.mean(axis=1, keepdims=True)
-            courses = courses - zero
+            is_first = self.site == "image" and self.of_one_capture
+            courses = courses - (courses[:, :1] if is_first else courses.mean(axis=1, keepdims=True))
         parts = values.reshape(len(self.quantities), -1) @ courses
         for quantity, part in zip(self.quantities, parts, strict=True):
             _add(changes, model, self.site, quantity, part=part)

@@ -10,7 +10,7 @@ from scipy.special import betaln
 from processing.diagnosis.search.averages import likely_starts, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
-from processing.diagnosis.search.correction import most_needed
+from processing.diagnosis.search.correction import needed_groups
 from processing.diagnosis.search.decision import predicted_change
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.likely_set import likely_set
@@ -312,10 +312,13 @@ def slipped(first):
 def test_a_correction_has_the_groups_that_it_needs_and_no_more():
     """In order of probability it took up to 300 groups, and an instrument file cannot hold so many."""
     random = np.random.default_rng(5)
-    quadratic = form(random.standard_normal((60, 30)), np.zeros(30))
-    mean = np.where(np.arange(30) < 3, 2.0, 0.01 * random.standard_normal(30))
-    quadratic = Quadratic(quadratic.excess, -quadratic.curvature @ mean, quadratic.curvature)
-    index = [np.array([k]) for k in range(30)][::-1]
-    used = np.arange(30) == 0
-    assert sorted(most_needed(quadratic, mean, index, is_used=used, most=4.0)) == [27, 28]
-    assert sorted(most_needed(quadratic, mean, index, is_used=used, most=0.0)) == list(range(29))
+    design = random.standard_normal((60, 30))
+    # Two of them cancel but for a part: neither fits without the other.
+    design[:, 4] = design[:, 3] + 0.3 * random.standard_normal(60)
+    mean = 0.01 * random.standard_normal(30)
+    mean[:5] = 0.0, 2.0, 2.0, 5.0, -5.0
+    curvature = design.T @ design
+    quadratic, index = Quadratic(0.0, -curvature @ mean, curvature), [np.array([k]) for k in range(30)]
+    kept = np.arange(30) == 0
+    assert needed_groups(quadratic, mean, index, kept=kept, most=1.0).tolist() == [0, 1, 2, 3, 4]
+    assert needed_groups(quadratic, mean, index, kept=kept, most=0.0).size == 30

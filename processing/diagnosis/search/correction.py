@@ -32,40 +32,37 @@ def applied(posterior: Posterior, base: Space, unfit: Collection[Candidate] = ()
     return space, space.vector(posterior.space.split(posterior.values))
 
 
-def _least_needed(posterior: Posterior, keep: Collection[Candidate]) -> list[int]:
-    """Groups in addition to `keep` that are likely enough, and further groups without which the fit gets worse."""
-    space, samples = posterior.space, posterior.samples
-    likely = np.flatnonzero(samples.takes_part)
-    index = [space.positions(members) for members in posterior.members]
-    is_used = np.concatenate([np.zeros(0, dtype=bool), *(np.full(c.size, c in keep) for c in space.candidates)])
-    for g in likely:
-        is_used[index[g]] = True
-    mean = posterior.values / space.joined("typical")
-    needed = most_needed(posterior.sets.form, mean, index, is_used=is_used, most=samples.best.unit)
-    return [*likely.tolist(), *needed]
+def _least_needed(posterior: Posterior, keep: Collection[Candidate]) -> NDArray[np.int64]:
+    """Groups that are likely enough, and further groups without which the fit gets worse, `keep` among them."""
+    candidates, samples = posterior.space.candidates, posterior.samples
+    kept = samples.takes_part | [all(candidates[k] in keep for k in members) for members in posterior.members]
+    mean = posterior.values / posterior.space.joined("typical")
+    index = [posterior.space.positions(members) for members in posterior.members]
+    return needed_groups(posterior.sets.form, mean, index, kept=kept, most=samples.best.unit)
 
 
-def most_needed(
-    form: Quadratic, mean: Array, index: Sequence[NDArray[np.int64]], *, is_used: Array, most: float
-) -> list[int]:
-    """Groups that a correction by a mean (K,) needs, so that chi-square is within `most` of that at the mean.
+def needed_groups(
+    form: Quadratic, mean: Array, index: Sequence[NDArray[np.int64]], *, kept: NDArray[np.bool_], most: float
+) -> NDArray[np.int64]:
+    """Groups of a correction by a mean (K,), with which chi-square is within `most` of that at the mean.
 
     Several groups that are unlikely one by one can be one cause together: the mean has a part of each, and these parts
-    fit only together. The group that takes most away comes first. `index` holds the values of each group, and `is_used`
-    (K,) those that are corrected already.
+    fit only together. So the group that is missed least goes first, unless it is `kept` (G,). `index` has the values of
+    each group.
     """
+    owner = np.repeat(np.arange(len(index)), [i.size for i in index])
+    positions = np.concatenate([np.zeros(0, dtype=np.int64), *index])
     own = np.array([mean[i] @ form.curvature[np.ix_(i, i)] @ mean[i] for i in index])
-    own[[bool(is_used[i].all()) for i in index]] = np.inf
-    x, chi2_at_mean = np.where(is_used, mean, 0.0), form.at(mean)
-    groups: list[int] = []
-    for _ in index:
-        if form.at(x) - chi2_at_mean <= most:
+    x, loss, is_needed = mean.copy(), 0.0, np.ones(len(index), dtype=bool)
+    while (may_go := is_needed & ~kept).any():
+        slope = mean * (form.gradient + form.curvature @ x)
+        missed = np.where(may_go, own - 2 * np.bincount(owner, slope[positions], len(index)), np.inf)
+        g = int(np.argmin(missed))
+        loss += missed[g]
+        if loss > most:
             break
-        slope = 2 * (form.gradient + form.curvature @ x) * mean
-        g = int(np.argmin(own + [float(slope[i].sum()) for i in index]))
-        groups.append(g)
-        x[index[g]], own[g] = mean[index[g]], np.inf
-    return groups
+        x[index[g]], is_needed[g] = 0.0, False
+    return np.flatnonzero(is_needed)
 
 
 def solution(
