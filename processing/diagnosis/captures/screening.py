@@ -25,7 +25,7 @@ from processing.reduction.move_image import taps
 
 #: [standard deviations of one intensity] By which a pixel is another one after the image was moved by half a pixel and
 #: back, from which on it is at an edge: what an image that moves does there cannot be undone.
-LOST_BY_MOVING = 0.5
+LOST_BY_MOVING = 0.35
 #: [of the pixels] Near an edge that are left out at most; where the image is all edges the flattest pixels are kept.
 MOST_STEEP = 0.75
 
