@@ -10,7 +10,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import Fit, Solution, held_out, minimize
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import LIKELY, LITTLE, SLACK, SURE
+from processing.diagnosis.search.rules import LIKELY, LITTLE, MISSED, SURE
 from processing.diagnosis.search.sets import Quadratic
 from processing.diagnosis.search.space import Problem, Space
 
@@ -38,7 +38,7 @@ def _least_needed(posterior: Posterior, keep: Collection[Candidate]) -> NDArray[
     kept = samples.takes_part | [all(candidates[k] in keep for k in members) for members in posterior.members]
     mean = posterior.values / posterior.space.joined("typical")
     index = [posterior.space.positions(members) for members in posterior.members]
-    return needed_groups(posterior.sets.form, mean, index, kept=kept, most=SLACK * samples.best.unit)
+    return needed_groups(posterior.sets.form, mean, index, kept=kept, most=MISSED * samples.best.unit)
 
 
 def needed_groups(
