@@ -7,7 +7,7 @@ from bench_capture import bench_capture, read
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.instrument.wiring import find_miswiring, find_train_miswiring
-from processing.instrument.model import InstrumentModel
+from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from simulators.blind.undeclared_captures import TrueBench
 
 
@@ -45,6 +45,16 @@ def test_what_is_no_mistake_is_not_called_one(configs, tmp_path, air, degrees):
     bench = TrueBench(og=np.deg2rad(-17.02 + degrees), dg=np.deg2rad(127.12 + degrees))
     bench.level.append(lambda k, a: 1 + 0.02 * np.sin(k))
     assert find_miswiring(problem(tmp_path, configs, bench, lambda a: a, air)) is None
+
+
+def test_an_effect_that_has_no_place_behind_exchanged_axes_is_no_error(configs, tmp_path):
+    """A corrected file could not be diagnosed again: light does not go back from the analyzer to the generator."""
+    file, place = configs / "instruments/rgb950.yaml", "retardance of psa_retarder by 1 x psg"
+    model, data = read(bench_capture(tmp_path, file, TrueBench(), True, seed=4), file)
+    values = {name: EffectParameter(value=0.01, unit="degree") for name in ("cos", "sin")}
+    effect = AppliedEffect(kind="unlisted", element=place, parameters=values)
+    model = model.model_copy(update={"effects": (effect,)})
+    assert find_miswiring(InstrumentProblem(model, [data])) is None
 
 
 @pytest.mark.parametrize("degrees", [18.0, 22.0])

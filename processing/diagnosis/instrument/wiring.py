@@ -20,6 +20,7 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.rules import NEEDED, OUTSTANDING
 from processing.diagnosis.search.space import Space
+from processing.effect import EffectError
 from processing.instrument.model import InstrumentModel
 
 #: [1] Factor by which less must be left over without a mistake of wiring: no small change of a value does that.
@@ -55,7 +56,7 @@ def find_miswiring(problem: InstrumentProblem, declared: InstrumentModel | None 
     if problem.nominal():
         return None
     nothing, none = Space(()), np.zeros(0)
-    mistakes = [*_mistakes(problem), *_other_wavelengths(problem, declared)]
+    mistakes = [*_possible(problem, declared)]
     wiring = _best(mistakes, [_chi2(w.problem, nothing, none) for w in mistakes], _chi2(problem, nothing, none))
     # Plates that are far off, or another mount, may come nearer to a mistake than to what is declared.
     return None if wiring is None or _fits_better(problem, wiring.problem) else wiring
@@ -71,7 +72,7 @@ def _fits_better(problem: InstrumentProblem, rewired: InstrumentProblem) -> bool
 def find_train_miswiring(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
     """The same where the train has nominal values, none of which fit: each mistake is judged by the best of them."""
     base = Space(problem.nominal())
-    mistakes = [*_mistakes(problem), *_other_wavelengths(problem, declared)]
+    mistakes = [*_possible(problem, declared)]
 
     def chi2(tried: InstrumentProblem) -> float:
         return _chi2(tried, base, best_of_starts(tried, base, FEW_STARTS).values)
@@ -91,6 +92,17 @@ def _chi2(problem: InstrumentProblem, space: Space, values: Array) -> float:
     if not problem.noise_known:
         return excess + freedom
     return max(excess, 0.0) + OUTSTANDING * float(np.sqrt(2 * max(freedom, 1.0) * problem.spread))
+
+
+def _possible(problem: InstrumentProblem, declared: InstrumentModel | None) -> Iterator[Wiring]:
+    """The mistakes without which every effect of the instrument file has a place in the train."""
+    for mistake in (*_mistakes(problem), *_other_wavelengths(problem, declared)):
+        try:
+            for k in range(len(problem.captures)):
+                mistake.problem.changes(k, Space(()), np.zeros(0))
+        except EffectError:
+            continue
+        yield mistake
 
 
 def _mistakes(problem: InstrumentProblem) -> Iterator[Wiring]:
