@@ -53,17 +53,23 @@ def test_the_error_is_what_one_standard_deviation_does(air, configs, tmp_path):
     assert wrong.max() > 0.01
 
 
-@pytest.mark.parametrize("lasting", [True, False])
-def test_a_correction_for_one_capture_alone_is_open_in_the_next_one(lasting, air, configs, tmp_path, monkeypatch):
-    """It was in no error bar: M of the next capture was wrong by 35 of them."""
+@pytest.mark.parametrize(
+    ("calibrate", "lasting", "is_corrected_later"),
+    [((), True, True), ((), False, False), (("psg_retarder.retardance_deg",), False, True)],
+)
+def test_what_is_not_corrected_in_a_later_capture_is_in_its_error_bar(
+    calibrate, lasting, is_corrected_later, air, configs, tmp_path, monkeypatch
+):
+    """It was in none: M of the next capture was wrong by 35 of them. Fitted values of the train count there too."""
     file = configs / "instruments/rgb950.yaml"
+    declared = InstrumentModel.load(file).model_copy(update={"calibrate": calibrate})
     monkeypatch.setattr("processing.diagnosis.instrument.diagnose.lasts", lambda *_: lasting)
-    judged, _ = diagnose_captures([air], InstrumentModel.load(file))
-    write_instrument(tmp_path / "new.yaml", InstrumentModel.load(file), judged.diagnosis)
+    judged, _ = diagnose_captures([air], declared)
+    write_instrument(tmp_path / "new.yaml", declared, judged.diagnosis)
     corrected = InstrumentModel.load(tmp_path / "new.yaml")
     bench = TrueBench(rows=16, columns=16, dg=np.deg2rad(128.12))
     later = bench_capture(tmp_path / "next", file, bench, air=True, seed=3).rename(tmp_path / "later.h5")
-    for path, is_corrected in ((air, True), (later, lasting)):
+    for path, is_corrected in ((air, True), (later, is_corrected_later)):
         product = reduced(path, corrected, path.with_suffix(".m.h5"))
         m, error = (product[name].mean(axis=(2, 3)) for name in ("mueller", "mueller_systematic"))
         wrong, error = np.abs(m / m[0, 0] - np.eye(4)).max(), error.max() / m[0, 0]

@@ -150,11 +150,12 @@ class MuellerErrors:
         return predicted_change(correction[index], self.values[index], covariance, products, along=along)
 
     def uncertain(
-        self, problem: InstrumentProblem, used: Solution, *, lasting: bool = True
+        self, problem: InstrumentProblem, used: Solution, *, lasting: bool
     ) -> tuple[SystematicError, MuellerError] | None:
         """Remaining uncertainty of M/m00 about the applied values, as a file stores it and as the answer reports it.
 
-        None where nothing does. A correction that is not `lasting` is uncertain as a whole in later captures.
+        None where nothing does. The effects of a correction that is not `lasting` are uncertain as a whole in later
+        captures, which it does not correct.
         """
         missed = self.values - self.corrected_values(used)
         covariance = self.covariance + np.outer(missed, missed)
@@ -173,9 +174,10 @@ class MuellerErrors:
         rms = float(np.sqrt(of_elements.sum() / 15))
         effects_of = partial(_effects_of, self.space, slopes, names)
         stored = [effects_of(d) for d in directions.T[: min(enough, MOST_STORED)]]
-        not_applied = np.where(lasts, self.corrected_values(used), 0.0)
+        is_effect = np.array([c in used.effects for c in self.space.candidates for _ in c.parameters])
+        not_applied = np.where(lasts & is_effect, self.corrected_values(used), 0.0)
         if not lasting and not_applied.any():
-            # In later captures; the same with the other sign cancels it in these.
+            # It holds in later captures: in these the same effects with the other sign cancel it.
             here = (e.model_copy(update={"scope": "capture", "captures": names}) for e in effects_of(-not_applied))
             stored.insert(0, (*effects_of(not_applied), *here))
         error = SystematicError(
