@@ -34,7 +34,7 @@ FEWEST_STATES = 7
 TIMES = ("over time", "settling", "warming")
 #: [modes] Of what wanders: half a period to so many halves in a capture; faster waves have a frequency.
 MODES = 12
-#: Sites without a zero of their own: M is the mean of a sample that changes, where the image stood in the first state.
+#: Sites without a zero of their own. M is that of the mean sample of a capture, with the image of the first state.
 WITHOUT_ZERO = ("sample", "image")
 #: Quantities that a plate that turns may have.
 OF_A_PLATE = (

@@ -130,7 +130,7 @@ def test_light_that_moves_over_a_disc_is_no_image_that_moves(configs, tmp_path, 
 def test_a_black_level_that_drifts_is_no_bent_response(configs, tmp_path, bench):
     diagnosis = diagnosed(tmp_path, configs, bench, drift_counts=200)
     assert not sure(diagnosis)
-    # Two exponential courses are nearly straight.
+    # Warming is an exponential course that is nearly straight.
     assert sentences(diagnosis)[0] == "offset of detector over time"
     assert all(sentence.startswith("offset of detector ") for sentence in sentences(diagnosis))
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.features import inside
+from processing.diagnosis.instrument.photon_noise import about_mean
 from processing.diagnosis.instrument.pixel_sums import Pixels
-from processing.diagnosis.instrument.problem import InstrumentProblem, about_mean
+from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.rules import FEWEST_PIXELS, LIMIT

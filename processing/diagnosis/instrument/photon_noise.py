@@ -24,6 +24,11 @@ def movable(shift_px: Array) -> bool:
     return bool(np.abs(shift_px).max() <= MARGIN)
 
 
+def about_mean(shift_px: Array) -> Array:
+    """Shifts (N, 2), pixels, from their mean. The fitted image has moved by the mean, so frames are moved the least."""
+    return np.asarray(shift_px - shift_px.mean(axis=0))
+
+
 def distance(undone: Mapping[Candidate, Array], space: Space, values: Array, *, pointwise: bool = False) -> float:
     """Largest distance of a correction from where it was undone, in typical sizes; of the `pointwise` ones alone."""
     away = [0.0]

@@ -21,7 +21,14 @@ from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.instrument.features import FEATURES
 from processing.diagnosis.instrument.moments import Moments, folds_of, moments_of
-from processing.diagnosis.instrument.photon_noise import distance, exactly_undone, movable, undoing, with_noise_of_light
+from processing.diagnosis.instrument.photon_noise import (
+    about_mean,
+    distance,
+    exactly_undone,
+    movable,
+    undoing,
+    with_noise_of_light,
+)
 from processing.diagnosis.instrument.projection import add_block, noise_information
 from processing.diagnosis.instrument.slopes import Columns, slopes_of_counts, slopes_of_rows
 from processing.diagnosis.instrument.tiles import add_tiles, slopes_of_tiles, tile_columns
@@ -446,11 +453,6 @@ class InstrumentProblem:
             )
         for each in tiles:
             add_tiles(data, moments, each, a, c=c, slopes=slopes, out=out, apart=self._rows_apart(k))
-
-
-def about_mean(shift_px: Array) -> Array:
-    """Shifts (N, 2) from their mean, which the image of an unknown sample takes up: so frames are moved the least."""
-    return np.asarray(shift_px - shift_px.mean(axis=0))
 
 
 def _moved_back(captures: Sequence[CaptureData], shifts_px: Sequence[Array]) -> tuple[CaptureData, ...]:

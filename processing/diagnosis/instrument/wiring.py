@@ -56,7 +56,7 @@ def find_miswiring(problem: InstrumentProblem, declared: InstrumentModel | None 
     if problem.nominal():
         return None
     nothing, none = Space(()), np.zeros(0)
-    mistakes = [*_possible(problem, declared)]
+    mistakes = list(_possible(problem, declared))
     wiring = _best(mistakes, [_chi2(w.problem, nothing, none) for w in mistakes], _chi2(problem, nothing, none))
     # Plates that are far off, or another mount, may come nearer to a mistake than to what is declared.
     return None if wiring is None or _fits_better(problem, wiring.problem) else wiring
@@ -72,7 +72,7 @@ def _fits_better(problem: InstrumentProblem, rewired: InstrumentProblem) -> bool
 def find_train_miswiring(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
     """The same where the train has nominal values, none of which fit: each mistake is judged by the best of them."""
     base = Space(problem.nominal())
-    mistakes = [*_possible(problem, declared)]
+    mistakes = list(_possible(problem, declared))
 
     def chi2(tried: InstrumentProblem) -> float:
         return _chi2(tried, base, best_of_starts(tried, base, FEW_STARTS).values)
@@ -95,7 +95,7 @@ def _chi2(problem: InstrumentProblem, space: Space, values: Array) -> float:
 
 
 def _possible(problem: InstrumentProblem, declared: InstrumentModel | None) -> Iterator[Wiring]:
-    """The mistakes without which every effect of the instrument file has a place in the train."""
+    """The mistakes after whose correction every effect of the instrument file still has a place in the train."""
     for mistake in (*_mistakes(problem), *_other_wavelengths(problem, declared)):
         try:
             for k in range(len(problem.captures)):

@@ -24,7 +24,7 @@ def applied(posterior: Posterior, base: Space, unfit: Collection[Candidate] = ()
         if cause.probability >= LIKELY:
             shares = [by_label[c] for c in cause.alternatives if posterior.samples.probability[by_label[c]] > 1 - SURE]
             keep.update(cause.candidates, (posterior.space.candidates[m] for g in shares for m in posterior.members[g]))
-    for g in _least_needed(posterior, keep):
+    for g in _groups(posterior, keep):
         keep |= {posterior.space.candidates[m] for m in posterior.members[g]}
     keep -= set(unfit)
     order = [*base.candidates, *(c for c in posterior.space.candidates if c in keep and c not in base.candidates)]
@@ -32,8 +32,8 @@ def applied(posterior: Posterior, base: Space, unfit: Collection[Candidate] = ()
     return space, space.vector(posterior.space.split(posterior.values))
 
 
-def _least_needed(posterior: Posterior, keep: Collection[Candidate]) -> NDArray[np.int64]:
-    """Groups that are likely enough, and further groups without which the fit gets worse, `keep` among them."""
+def _groups(posterior: Posterior, keep: Collection[Candidate]) -> NDArray[np.int64]:
+    """Groups of `keep`, those that are likely enough, and further ones without which the fit gets worse."""
     candidates, samples = posterior.space.candidates, posterior.samples
     kept = samples.takes_part | [all(candidates[k] in keep for k in members) for members in posterior.members]
     mean = posterior.values / posterior.space.joined("typical")
@@ -44,19 +44,20 @@ def _least_needed(posterior: Posterior, keep: Collection[Candidate]) -> NDArray[
 def needed_groups(
     form: Quadratic, mean: Array, index: Sequence[NDArray[np.int64]], *, kept: NDArray[np.bool_], most: float
 ) -> NDArray[np.int64]:
-    """Groups of a correction by a mean (K,), with which chi-square is within `most` of that at the mean.
+    """Groups with which a correction by a mean (K,) has a chi-square within `most` of that of the whole mean.
 
     Several groups that are unlikely one by one can be one cause together: the mean has a part of each, and these parts
-    fit only together. So the group that is missed least goes first, unless it is `kept` (G,). `index` has the values of
-    each group.
+    fit only together. So groups are left out, the one that is missed least first, and never one that is `kept` (G,).
+    `index` has the positions of the values of each group.
     """
-    owner = np.repeat(np.arange(len(index)), [i.size for i in index])
-    positions = np.concatenate([np.zeros(0, dtype=np.int64), *index])
+    group = np.zeros(mean.size, dtype=np.int64)
+    for g, positions in enumerate(index):
+        group[positions] = g
     own = np.array([mean[i] @ form.curvature[np.ix_(i, i)] @ mean[i] for i in index])
     x, loss, is_needed = mean.copy(), 0.0, np.ones(len(index), dtype=bool)
     while (may_go := is_needed & ~kept).any():
         slope = mean * (form.gradient + form.curvature @ x)
-        missed = np.where(may_go, own - 2 * np.bincount(owner, slope[positions], len(index)), np.inf)
+        missed = np.where(may_go, own - 2 * np.bincount(group, slope, len(index)), np.inf)
         g = int(np.argmin(missed))
         loss += missed[g]
         if loss > most:

@@ -98,8 +98,8 @@ EXACT = 0.3
 #: [probability] From which on a group takes part in the correction that is written. What is less likely moves the mean
 #: by less than its own error.
 TAKES_PART = 0.25
-#: [unit of chi-square] That a correction may lose against the posterior mean: less is hardly beyond chance, and with
-#: less a file holds effects without weight.
+#: [unit of chi-square] That a correction may lose against the posterior mean. With less, the file holds effects without
+#: weight; with more, M departs from that of the mean.
 MISSED = 3.0
 #: [1] Growth of the residual on held-out data that is still put down to chance.
 WORSE = 1.002
