@@ -31,6 +31,8 @@ IFF_UP = 1
 MOST_BYTES = 2 << 20
 #: How many tests marked `long` a run leaves out.
 LEFT_OUT = pytest.StashKey[int]()
+#: What test processes are forked from.
+SERVER = pytest.StashKey[Any]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -65,6 +67,22 @@ def pytest_configure(config: pytest.Config) -> None:
     if os.geteuid() == 0 and ctypes.CDLL(None, use_errno=True).unshare(CLONE_NEWNET) == 0:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
             fcntl.ioctl(control, SIOCSIFFLAGS, struct.pack("16sH14x", b"lo", IFF_UP))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes(config: pytest.Config, specs: list[Any]) -> None:
+    """Let all test processes share one collection."""
+    from tests.worker_server import WorkerServer
+
+    config.stash[SERVER] = WorkerServer(config.invocation_params.args)
+    for spec in specs:
+        spec.python = config.stash[SERVER].command
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """End the server of test processes."""
+    if SERVER in config.stash:
+        config.stash[SERVER].close()
 
 
 @pytest.hookimpl(trylast=True)

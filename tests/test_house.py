@@ -81,6 +81,7 @@ def two_tests(tmp_path):
     (tmp_path / "pytest.ini").write_text("[pytest]\ntestpaths = tests\nmarkers = long\n")
     (tmp_path / "tests").mkdir()
     shared = (ROOT / "tests/conftest.py").read_text(encoding="utf-8")
+    (tmp_path / "tests/worker_server.py").write_bytes((ROOT / "tests/worker_server.py").read_bytes())
     # Loading what draws takes most of the time.
     (tmp_path / "tests/conftest.py").write_text(re.sub(r"^import matplotlib.*\n", "", shared, flags=re.M))
     (tmp_path / "tests/test_two.py").write_text(
@@ -97,6 +98,11 @@ def test_long_tests_are_left_out_with_a_line(two_tests):
     output = two_tests("-n", "1")
     assert "1 passed" in output
     assert "1 long tests left out; run them too: ./lab test --all" in output
+
+
+def test_a_file_that_cannot_be_imported_is_reported(two_tests, tmp_path):
+    (tmp_path / "tests/test_three.py").write_text("import nothing_there\n")
+    assert "No module named 'nothing_there'" in two_tests("-n", "1")
 
 
 @pytest.mark.parametrize("options", [("--all",), ("-m", "not other")])
