@@ -1,5 +1,6 @@
 """Axes and cameras of Micro-Manager: the conformance suites over devices that a core of this process holds."""
 
+import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -23,6 +24,9 @@ from simulators.serial.reply_faults import Fault, FaultSchedule
 pytest.importorskip("pymmcore_plus")
 from pymmcore_plus.core import _mmcore_plus
 from pymmcore_plus.experimental.unicore import SimpleCameraDevice, StageDevice, UniMMCore
+
+# It lets every library write its debug lines: those of numba take a tenth of a compilation.
+logging.getLogger().setLevel(logging.WARNING)
 
 
 @pytest.fixture(scope="module")

@@ -122,6 +122,7 @@ def test_a_rotator_of_limited_travel_takes_the_same_states_half_a_turn_away(
         assert np.all(np.abs(capture.angles_deg["psa"]) <= 95)
 
 
+@pytest.mark.long
 def test_the_description_of_a_camera_itself_is_played(
     acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path
 ) -> None:

@@ -192,7 +192,8 @@ def test_exposure_is_found_for_each_geometry(acquire, small_rig, campaign, tmp_p
 
 def test_found_exposure_leaves_room_for_the_bracket(acquire, small_rig, tmp_path):
     plan = tmp_path / "plan.yaml"
-    plan.write_text("kind: plan\nexposure_s: {kind: auto}\nbracket: [1, 8]\ndarks: 1\n")
+    states = "{kind: rotating_retarders, states: 16, step_deg: 9, ratio: 4.91}"
+    plan.write_text(f"kind: plan\nstates: {states}\nexposure_s: {{kind: auto}}\nbracket: [1, 8]\ndarks: 1\n")
     rig = small_rig(top={"exposure_s": [1e-5, 0.08]}, flux_e_per_s=2e5)
     code, _, err = acquire("--plan", plan, "--rig", rig, "--out", tmp_path)
     assert code == 0, err

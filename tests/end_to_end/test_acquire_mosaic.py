@@ -1,14 +1,15 @@
 """`acquire --mode stokes` on the tables of Lucid's polarization cameras, wherever the region begins.
 
 The light is oblique and elliptical, so that no two analyzers see the same: exchanged ones, or a mosaic that begins one
-pixel beside where it is taken to begin, turn the angle by tens of degrees. CI takes a format in each phase;
-``UMOV_EVERY_TABLE=1`` in the environment takes all formats of both tables in all phases.
+pixel beside where it is taken to begin, turn the angle by tens of degrees. CI takes two formats, the nightly run one in
+each phase; ``UMOV_EVERY_TABLE=1`` in the environment takes all formats of both tables in all phases.
 """
 
 import os
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -99,16 +100,13 @@ def taken(stokes, table: str, region: dict[str, object]) -> Path:
     return Path(path)
 
 
-def raw_cases() -> list[tuple[str, Offset]]:
+def raw_cases() -> list[Any]:
     if EVERY:
         return list(product(formats_of(MONO, angles=False), PHASES))
-    return [
-        ("PolarizeMono12p", (0, 0)),
-        ("PolarizeMono8", (1, 0)),
-        ("PolarizeMono12Packed", (0, 1)),
-        ("PolarizeMono12", (3, 5)),
-        ("PolarizeMono16", (1, 1)),
-    ]
+    # Every format and every phase have a cheaper test: `test_camera_node_maps.py`, `test_mosaic_phase.py`.
+    others = [("PolarizeMono12p", (0, 0)), ("PolarizeMono8", (1, 0)), ("PolarizeMono12", (3, 5))]
+    short = [("PolarizeMono12Packed", (0, 1)), ("PolarizeMono16", (1, 1))]
+    return [*short, *(pytest.param(*case, marks=pytest.mark.long) for case in others)]
 
 
 @pytest.mark.parametrize(("name", "offset"), raw_cases())

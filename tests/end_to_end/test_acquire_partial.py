@@ -56,7 +56,13 @@ def rig_of(name, small_rig, configs):
     )
 
 
-@pytest.mark.parametrize("name", INSTRUMENTS)
+#: Of the others `test_partial_polarimeters.py` and `test_reduce.py` reduce captures.
+SHORT = {"dual_beam_charis", "mosaic_polarimeter"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] * (name not in SHORT)) for name in INSTRUMENTS]
+)
 def test_from_plan_to_product(name, acquire, small_rig, configs, tmp_path):
     states, rank = INSTRUMENTS[name]
     rig = rig_of(name, small_rig, configs)

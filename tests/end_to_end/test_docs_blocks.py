@@ -9,7 +9,6 @@ title that says what it is: `NAME.yaml` is written for the commands that follow,
 
 import contextlib
 import glob
-import logging
 import os
 import re
 import runpy
@@ -114,8 +113,6 @@ def blocks_of(page: Path) -> list[Block]:
     return blocks
 
 
-# The parser logs every rule that it tries, which takes as long as the parsing.
-logging.getLogger("markdown_it").setLevel(logging.INFO)
 BLOCKS = [block for page in PAGES for block in blocks_of(page)]
 
 

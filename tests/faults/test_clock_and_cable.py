@@ -53,7 +53,8 @@ class MachineClocks:
         monkeypatch.setattr(aravis_stream.FrameStream, "take", stamped)
 
 
-@pytest.mark.parametrize("step_s", [3600.0, -1.5])
+# An hour ahead: also by `test_injected_faults.py`.
+@pytest.mark.parametrize("step_s", [pytest.param(3600.0, marks=pytest.mark.long), -1.5])
 def test_a_clock_that_is_set_in_mid_run_leaves_order_and_frames_right(run_with, intact, monkeypatch, step_s):
     clocks, before = MachineClocks(monkeypatch), time.time()
 

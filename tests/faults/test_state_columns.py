@@ -38,31 +38,32 @@ def test_noise_of_each_state_is_what_the_file_says(tmp_path, configs):
     assert np.sqrt(data.variance()[:, 1, 0, 0]) * full_scale == pytest.approx(2.0 + np.arange(46))
 
 
-@pytest.mark.parametrize("weighted", [False, True])
-def test_a_reduction_weighs_and_tells_errors_by_the_noise_that_is_stated(tmp_path, configs, weighted):
+def test_a_reduction_weighs_and_tells_errors_by_the_noise_that_is_stated(tmp_path, configs):
     """Elements scatter by their errors over many captures of which half of the states are ten times as noisy."""
     instrument, random = configs / "instruments/drr_wollaston.yaml", np.random.default_rng(3)
     psg = 4.0 * np.arange(46)
-    w = InstrumentModel.load(instrument).nominal_at(1200).rows({"psg": psg}).reshape(46, 2, 16)
+    model = InstrumentModel.load(instrument).nominal_at(1200)
+    w = model.rows({"psg": psg}).reshape(46, 2, 16)
     light = 1000 * w @ np.eye(4).reshape(16)
     sigma = np.where(np.arange(46) % 2, 1.0, 10.0)
-    matrices, errors = [], []
+    images = []
     for k in range(12):
         noisy = light + sigma[:, None] * random.standard_normal(light.shape)
         rows = [f"{n},{psg[n]},{a},{b},{sigma[n]}" for n, (a, b) in enumerate(noisy)]
-        out, product = tmp_path / f"c{k}.h5", tmp_path / f"m{k}.h5"
+        out = tmp_path / f"c{k}.h5"
         import_capture(ImportRequest(written(tmp_path, HEAD + ",sigma", rows), out, 1200, instrument=instrument))
-        with Capture(out) as capture:
-            model = InstrumentModel.load(instrument).nominal_at(1200)
-            facts = reduce_mueller(capture, model, product, (), choice=Choice(weighted=weighted))
-        image = MuellerImage.load(product)
-        matrices.append(image.values[..., 0, 0])
-        errors.append(image.errors[..., 0, 0])
-    assert "sigma" in facts["noise"]
-    pull = (np.array(matrices) - 1000 * np.eye(4)) / np.array(errors)
-    assert np.sqrt(np.mean(pull**2)) == pytest.approx(1.0, abs=0.25)
-    # Weights use the precise half; without them the noisy half decides.
-    assert (errors[0].max() < 12.0) == weighted
+        for weighted in (False, True):
+            product = tmp_path / f"m{k}{weighted}.h5"
+            with Capture(out) as capture:
+                reduce_mueller(capture, model, product, (), choice=Choice(weighted=weighted))
+            images.append(MuellerImage.load(product))
+    for weighted in (False, True):
+        matrices, errors = ([getattr(i, name)[..., 0, 0] for i in images[weighted::2]] for name in ("values", "errors"))
+        assert "sigma" in images[weighted].facts["noise"]
+        pull = (np.array(matrices) - 1000 * np.eye(4)) / np.array(errors)
+        assert np.sqrt(np.mean(pull**2)) == pytest.approx(1.0, abs=0.25)
+        # Weights use the precise half; without them the noisy half decides.
+        assert (errors[0].max() < 12.0) == weighted
 
 
 def test_a_capture_without_stated_noise_has_none(tmp_path):

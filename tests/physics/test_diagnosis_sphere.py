@@ -107,9 +107,16 @@ def test_light_from_the_support_is_interreflection(scene, configs, tmp_path):
     assert d.verdict in ("explained", "partly_explained")
 
 
-@pytest.mark.parametrize("kind", ["not_degenerate", pytest.param("slow_turn", marks=pytest.mark.long)])
-def test_what_is_not_in_the_list_gets_no_name(scene, configs, tmp_path, kind):
-    declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+@pytest.mark.parametrize(
+    ("instrument", "kind"),
+    [
+        ("linear_stokes", "dented"),
+        pytest.param("rgb950", "not_degenerate", marks=pytest.mark.long),
+        pytest.param("rgb950", "slow_turn", marks=pytest.mark.long),
+    ],
+)
+def test_what_is_not_in_the_list_gets_no_name(scene, configs, tmp_path, instrument, kind):
+    declared = InstrumentModel.load(configs / f"instruments/{instrument}.yaml")
     fault = drawn(kind, np.random.default_rng(4), scene, declared)
     d, _ = diagnosed(tmp_path, fault, declared, scene)
     assert d.verdict == "unexplained"

@@ -282,7 +282,6 @@ def test_bad_layouts_and_frames() -> None:
 @pytest.mark.parametrize(
     ("dtype", "arrangement"),
     [
-        (np.uint8, (("90", "45"), ("135", "0"))),
         (np.uint16, (("0", "135"), ("45", "90"))),
         (np.float32, (("90", "45"), ("135", "0"))),
     ],
