@@ -67,11 +67,10 @@ def xi0_of(product: Path) -> np.ndarray:
         return opened.get("xi0")
 
 
-@pytest.fixture
-def truth(original: Path, tmp_path: Path) -> np.ndarray:
+@pytest.fixture(scope="module")
+def truth(original: Path, tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
     """xi0 of the capture where nothing was run before."""
-    fresh = tmp_path / "fresh"
-    fresh.mkdir()
+    fresh = tmp_path_factory.mktemp("fresh")
     shutil.copy(original, fresh / "c.h5")
     return xi0_of(Xi0(Reduction(fresh / "c.h5").make()).make())
 

@@ -15,6 +15,7 @@ import acquisition
 import processing
 import umov
 from processing.errors import ProcessError
+from tests.rig_files import write_rig
 
 
 @pytest.mark.parametrize("package", [processing, acquisition], ids=lambda p: p.__name__)
@@ -45,13 +46,14 @@ def test_importing_a_package_loads_nothing_heavy():
     assert done.stdout.strip() == "set()"
 
 
-@pytest.fixture
-def capture(small_rig, tmp_path):
+@pytest.fixture(scope="module")
+def capture(configs, tmp_path_factory):
     """Taken with the ten lines of the docstring."""
     from acquisition import MeasurementPlan, load_rig, take_capture
 
+    folder = tmp_path_factory.mktemp("interface")
     plan = MeasurementPlan(omega_deg=35, wavelength_nm=662)
-    return take_capture(plan, load_rig(small_rig()), tmp_path / "captures")
+    return take_capture(plan, load_rig(write_rig(configs, folder / "rig.yaml")), folder / "captures")
 
 
 def test_from_capture_to_labelled_mueller_image_and_back(capture, tmp_path):

@@ -31,7 +31,7 @@ def test_disc_too_small_is_refused_before_any_motion(spawn, plan_file, quick_rig
 
 
 def test_second_program_is_refused_with_the_name_of_the_first(spawn, partial_of, plan_file, quick_rig, tmp_path):
-    with serve(quick_rig("behind.yaml", clock_speed=2), tmp_path / "rig.yaml", "red_sphere"):
+    with serve(quick_rig("behind.yaml", clock_speed=2), tmp_path / "rig.yaml", "red_sphere") as simulation:
         first = spawn("--omega", 35, "--plan", plan_file, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "first")
         partial_of(tmp_path / "first", first, states=2)
         second = spawn("--omega", 35, "--plan", plan_file, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "second")
@@ -40,6 +40,7 @@ def test_second_program_is_refused_with_the_name_of_the_first(spawn, partial_of,
         assert f"pid {first.pid}" in err
         assert not list((tmp_path / "second").glob("*"))
         # The first one has not noticed.
+        simulation.clock.speed = 50
         _, err = first.communicate()
         assert first.returncode == 0, err
 

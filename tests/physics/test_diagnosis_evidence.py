@@ -22,7 +22,7 @@ from processing.storage.formats.import_request import ImportRequest, read_sample
 from processing.storage.formats.importing import import_capture
 from simulators.blind.undeclared_captures import TrueBench, state_angles
 
-STATES = 24
+STATES = 18
 
 
 @pytest.fixture
