@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from types import ModuleType
 
 
@@ -42,21 +43,26 @@ def _serve(number: str, *arguments: str) -> None:
 
     listener = socket.socket(fileno=int(number))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if pytest.main([*arguments, "--collect-only", "-qq", "-p", "no:cacheprovider"]):
-        # What cannot be imported each process tries again, and reports.
-        for name in [name for name in sys.modules if name.startswith("tests.")]:
-            del sys.modules[name]
     with tempfile.TemporaryDirectory() as locks:
         _compile_once(locks)
+        _fork(_compile_early)
+        if pytest.main([*arguments, "--collect-only", "-qq", "-p", "no:cacheprovider"]):
+            # What cannot be imported each process tries again, and reports.
+            for name in [name for name in sys.modules if name.startswith("tests.")]:
+                del sys.modules[name]
         gc.freeze()
         while listener in select.select([listener, 0], [], [])[0]:
             connection, _ = listener.accept()
-            if os.fork() == 0:
-                try:
-                    _work(connection)
-                finally:
-                    os._exit(0)
+            _fork(_work, connection)
             connection.close()
+
+
+def _fork(task: Callable[..., None], *arguments: object) -> None:
+    if os.fork() == 0:
+        try:
+            task(*arguments)
+        finally:
+            os._exit(0)
 
 
 def _compile_once(locks: str) -> None:
@@ -74,6 +80,17 @@ def _compile_once(locks: str) -> None:
             return compile_loop(loop, signature)
 
     Dispatcher.compile = compile_alone
+
+
+def _compile_early() -> None:
+    """Compile what takes longest while the tests are imported: another processor has nothing to do."""
+    import numpy as np
+
+    from processing.polarization.cloude import xi0_and_dominant
+    from processing.polarization.decompositions.lu_chipman import lu_chipman
+
+    xi0_and_dominant(np.eye(4))
+    lu_chipman(np.eye(4))
 
 
 def _work(connection: socket.socket) -> None:
