@@ -39,7 +39,9 @@ INSTRUMENTS = {
         {"psg": np.repeat([0.0, 60, 120, 20], 4), "psa": np.tile([0.0, 60, 120, 100], 4)},
     ),
 }
-GAIN, READ = 2.0, 3.0
+ELECTRONS, GAIN, READ = 20_000.0, 2.0, 3.0
+#: Counts of an unpolarized sample that sends all light on.
+SCALE = 2 * ELECTRONS / GAIN
 STEPS = (Step("reduce", {}),)
 SAMPLE = np.array([[1, 0.2, -0.1, 0.05], [0.15, 0.6, 0.1, -0.2], [-0.3, 0.05, 0.5, 0.1], [0.2, 0.1, -0.15, 0.4]])
 
@@ -52,13 +54,12 @@ def names_of(is_determined):
 def noisy(synthetic_capture, configs):
     """Makes a capture of 30 x 40 pixels of one sample, with its own shot and read noise."""
 
-    def make(name, angles, electrons=20_000.0, top=None, sample=SAMPLE, sent_deg=None):
+    def make(name, angles, top=None, sample=SAMPLE, sent_deg=None):
         model = InstrumentModel.load(configs / f"instruments/{name}.yaml")
         if sent_deg is not None:
-            model = model.model_copy(
-                update={"generator": (Polarizer(kind="polarizer", name="sent", azimuth_deg=sent_deg),)}
-            )
-        signal = model.rows(angles).reshape(-1, 16) @ sample.reshape(16) * electrons * 2
+            sent = Polarizer(kind="polarizer", name="sent", azimuth_deg=sent_deg)
+            model = model.model_copy(update={"generator": (sent,)})
+        signal = model.rows(angles).reshape(-1, 16) @ sample.reshape(16) * ELECTRONS * 2
         random = np.random.default_rng(4)
         light = random.poisson(signal[:, None, None, None], (len(signal), 1, 30, 40))
         counts = (light + random.normal(0, READ, light.shape)) / GAIN + 100
@@ -66,27 +67,32 @@ def noisy(synthetic_capture, configs):
         if top:
             frames[2, 0, :3] = top
         detector = {"gain_e_per_count": GAIN, "read_noise_e": READ, "black_level_counts": 100, "bits": 16}
-        return synthetic_capture(frames, angles, detector=detector), model, electrons * 2 / GAIN
+        return synthetic_capture(frames, angles, detector=detector), model
 
     return make
+
+
+def reduced(noisy_capture, out, **choice):
+    """Reduce a capture of `noisy`; return the facts of the product."""
+    path, model = noisy_capture
+    with Capture(path) as capture:
+        return reduce_mueller(capture, model, out, STEPS, choice=Choice(**choice))
 
 
 @pytest.mark.parametrize(("name", "weighted"), [*((name, False) for name in INSTRUMENTS), ("linear_mueller", True)])
 def test_what_is_determined_is_reported_with_its_error_and_the_rest_is_not(name, weighted, noisy, tmp_path):
     elements, angles = INSTRUMENTS[name]
-    path, model, scale = noisy(name, angles)
+    path, model = noisy(name, angles)
     is_determined = determined_elements(determined_basis(model))
     assert names_of(is_determined) == elements
-    with Capture(path) as capture:
-        choice = Choice(weighted=weighted, covariance=weighted)
-        facts = reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),), choice=choice)
+    facts = reduced((path, model), tmp_path / "m.h5", weighted=weighted, covariance=weighted)
     assert (facts["rank"], facts["determined"].replace(",", "")) == (is_determined.sum(), elements)
     assert facts["median_reduced_chi_square"] == pytest.approx(1, abs=0.35)
     image = MuellerImage.load(tmp_path / "m.h5")
     values, errors = image.values.reshape(16, -1), image.errors.reshape(16, -1)
     assert np.isnan(values[~is_determined]).all()
     assert np.isnan(errors[~is_determined]).all()
-    pulls = (values[is_determined] - scale * SAMPLE.reshape(16, 1)[is_determined]) / errors[is_determined]
+    pulls = (values[is_determined] - SCALE * SAMPLE.reshape(16, 1)[is_determined]) / errors[is_determined]
     count = pulls.shape[1]
     assert np.abs(pulls.mean(axis=1)).max() < 5 / np.sqrt(count)
     # Five standard deviations of the scatter of a standard deviation.
@@ -95,21 +101,17 @@ def test_what_is_determined_is_reported_with_its_error_and_the_rest_is_not(name,
 
 @pytest.mark.parametrize("weighted", [False, True])
 def test_saturated_states_are_left_out_there_too(weighted, noisy, tmp_path):
-    path, model, scale = noisy("rotating_retarder_stokes", INSTRUMENTS["rotating_retarder_stokes"][1], top=65535)
-    with Capture(path) as capture:
-        choice = Choice(weighted=weighted)
-        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),), choice=choice)
+    capture = noisy("rotating_retarder_stokes", INSTRUMENTS["rotating_retarder_stokes"][1], top=65535)
+    reduced(capture, tmp_path / "m.h5", weighted=weighted)
     image = MuellerImage.load(tmp_path / "m.h5")
     assert (image.mask[:3] == Mask.SATURATED).all()
-    stokes = image.values[:, 0, :3].reshape(4, -1) / scale
+    stokes = image.values[:, 0, :3].reshape(4, -1) / SCALE
     assert stokes.mean(axis=1) == pytest.approx(SAMPLE[:, 0], abs=0.01)
 
 
 @pytest.mark.parametrize("name", INSTRUMENTS)
 def test_quantities_are_those_that_the_elements_give(name, noisy, tmp_path):
-    path, model, _ = noisy(name, INSTRUMENTS[name][1])
-    with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
+    reduced(noisy(name, INSTRUMENTS[name][1]), tmp_path / "m.h5")
     quantities_of_mueller(tmp_path / "m.h5", tmp_path / "q.h5", Step("quantities", {}))
     truth = {
         "diattenuation_linear": np.hypot(0.2, 0.1),
@@ -147,9 +149,7 @@ def test_quantities_are_those_that_the_elements_give(name, noisy, tmp_path):
 def test_xi0_comes_with_a_model_of_the_dominant_process(name, noisy, tmp_path, monkeypatch):
     xi0, jones = 0.6, np.array([[1.0, 0.1], [0.2j, -0.6]])
     m0 = normalized_mueller(jones)
-    path, model, _ = noisy(name, INSTRUMENTS[name][1], sample=np.asarray(mueller_matrix(m0, xi0, 1.0)))
-    with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
+    reduced(noisy(name, INSTRUMENTS[name][1], sample=np.asarray(mueller_matrix(m0, xi0, 1.0))), tmp_path / "m.h5")
     monkeypatch.setattr(maps, "dominant_model", lambda *_: np.tile(m0, (30, 40, 1, 1)))
     maps.xi0_of_partial(
         tmp_path / "m.h5", "geometry", "material", tmp_path / "x.h5", step=Step("xi0", {}), overwrite=False
@@ -166,9 +166,7 @@ def test_xi0_comes_with_a_model_of_the_dominant_process(name, noisy, tmp_path, m
 def test_polarized_light_gives_the_stokes_vector_that_is_sent_back_and_xi0(name, noisy, tmp_path, monkeypatch):
     m0, xi0 = normalized_mueller(np.array([[1.0, 0.1], [0.2j, -0.6]])), 0.6
     sample = np.asarray(mueller_matrix(m0, xi0, 1.0))
-    path, model, scale = noisy(name, INSTRUMENTS[name][1], sample=sample, sent_deg=20.0)
-    with Capture(path) as capture:
-        facts = reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
+    facts = reduced(noisy(name, INSTRUMENTS[name][1], sample=sample, sent_deg=20.0), tmp_path / "m.h5")
     count = facts["rank"]
     assert facts["determined"].startswith(", ".join(f"S{k}" for k in range(count)) + " of the light")
     with pytest.raises(ProductError, match=r"needs all 16 elements\. With a model"):
@@ -178,7 +176,7 @@ def test_polarized_light_gives_the_stokes_vector_that_is_sent_back_and_xi0(name,
         stokes, errors = (product.get(plane).reshape(4, -1) for plane in ("stokes", "stokes_errors"))
         assert product_figure(product)
     # For a light of intensity 1.
-    pulls = (stokes - scale * (sample @ light / 0.5)[:, None]) / errors
+    pulls = (stokes - SCALE * (sample @ light / 0.5)[:, None]) / errors
     assert np.isnan(pulls[count:]).all()
     assert np.abs(pulls[:count].mean(axis=1)).max() < 5 / np.sqrt(pulls.shape[1])
     assert pulls[:count].std(axis=1) == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.shape[1]))
@@ -194,9 +192,7 @@ def test_polarized_light_gives_the_stokes_vector_that_is_sent_back_and_xi0(name,
 @pytest.mark.parametrize(("name", "weighted"), [("rotating_retarder_stokes", True), ("rotating_analyzer", False)])
 def test_polarized_light_has_maps_of_what_the_sample_sends_back(name, weighted, noisy, tmp_path):
     sample = np.asarray(mueller_matrix(normalized_mueller(np.array([[1.0, 0.1], [0.2j, -0.6]])), 0.6, 1.0))
-    path, model, _ = noisy(name, INSTRUMENTS[name][1], sample=sample, sent_deg=20.0)
-    with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),), choice=Choice(weighted=weighted))
+    reduced(noisy(name, INSTRUMENTS[name][1], sample=sample, sent_deg=20.0), tmp_path / "m.h5", weighted=weighted)
     facts = quantities_of_mueller(tmp_path / "m.h5", tmp_path / "q.h5", Step("quantities", {}))
     assert "lit in one polarized state" in facts["warnings"][0]
     s = sample @ [1, np.cos(np.deg2rad(40)), np.sin(np.deg2rad(40)), 0]
@@ -219,9 +215,7 @@ def test_polarized_light_has_maps_of_what_the_sample_sends_back(name, weighted, 
 @pytest.mark.parametrize("sent_deg", [None, 20.0])
 def test_the_covariance_of_the_stokes_vector_is_that_of_its_scatter(sent_deg, noisy, tmp_path):
     angles = {"psa": np.array([-51.7, -15.1, 15.1, 51.7, 20.0, 70.0])}
-    path, model, _ = noisy("rotating_retarder_stokes", angles, sent_deg=sent_deg)
-    with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
+    reduced(noisy("rotating_retarder_stokes", angles, sent_deg=sent_deg), tmp_path / "m.h5")
     quantities_of_mueller(tmp_path / "m.h5", tmp_path / "q.h5", Step("quantities", {}))
     with Product(tmp_path / "q.h5") as product:
         packed = product.get("stokes_covariance").reshape(10, -1).mean(axis=1)
@@ -245,9 +239,8 @@ def test_the_covariance_of_the_stokes_vector_is_that_of_its_scatter(sent_deg, no
 def test_the_ellipticity_is_in_its_interval_for_any_light(vector, sent_deg, noisy, tmp_path):
     sample = np.zeros((4, 4))
     sample[:, 0] = 1, *vector
-    path, model, _ = noisy("rotating_retarder_stokes", {"psa": 22.5 * np.arange(16)}, sample=sample, sent_deg=sent_deg)
-    with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
+    capture = noisy("rotating_retarder_stokes", {"psa": 22.5 * np.arange(16)}, sample=sample, sent_deg=sent_deg)
+    reduced(capture, tmp_path / "m.h5")
     quantities_of_mueller(tmp_path / "m.h5", tmp_path / "q.h5", Step("quantities", {}))
     truth = np.rad2deg(np.arctan2(vector[2], np.hypot(*vector[:2]))) / 2
     with Product(tmp_path / "q.h5") as product:
@@ -265,9 +258,8 @@ def test_the_ellipticity_is_in_its_interval_for_any_light(vector, sent_deg, nois
 def test_the_mean_of_a_stokes_polarimeter_has_the_names_of_light(sent_deg, noisy, tmp_path):
     sample = np.zeros((4, 4))
     sample[:, 0] = 1, 0.3, 0.2, -0.4
-    path, model, _ = noisy("rotating_retarder_stokes", {"psa": 22.5 * np.arange(16)}, sample=sample, sent_deg=sent_deg)
-    with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
+    capture = noisy("rotating_retarder_stokes", {"psa": 22.5 * np.arange(16)}, sample=sample, sent_deg=sent_deg)
+    reduced(capture, tmp_path / "m.h5")
     means = {mean.name: mean for mean in mean_of([tmp_path / "m.h5"], (slice(0, 30), slice(0, 40)))}
     truth = {"s1_over_s0": 0.3, "s2_over_s0": 0.2, "s3_over_s0": -0.4, "dolp": np.hypot(0.3, 0.2), "docp": -0.4}
     truth |= {"dop": np.sqrt(0.29), "aolp_deg": np.rad2deg(np.arctan2(0.2, 0.3)) / 2}
@@ -279,11 +271,10 @@ def test_the_mean_of_a_stokes_polarimeter_has_the_names_of_light(sent_deg, noisy
 
 @pytest.mark.parametrize("name", ["rotating_analyzer", "linear_mueller"])
 def test_an_uncertain_instrument_leaves_the_noise_of_a_mean_as_it_is(name, noisy, tmp_path):
-    path, model, _ = noisy(name, INSTRUMENTS[name][1])
+    path, model = noisy(name, INSTRUMENTS[name][1])
     means = []
     for k, stderr in enumerate([{}, {"analyzer.azimuth_deg": 0.5}]):
-        with Capture(path) as capture:
-            reduce_mueller(capture, model.model_copy(update={"stderr": stderr}), tmp_path / f"{k}.h5", STEPS)
+        reduced((path, model.model_copy(update={"stderr": stderr})), tmp_path / f"{k}.h5")
         means.append({m.name: m for m in mean_of([tmp_path / f"{k}.h5"], (slice(0, 30), slice(0, 40)))})
     certain, uncertain = means
     assert certain.keys() == uncertain.keys()
@@ -303,9 +294,7 @@ def titles(product):
 
 def test_a_stokes_polarimeter_has_a_figure_of_the_stokes_vector(noisy, tmp_path):
     name = "rotating_retarder_stokes"
-    path, model, _ = noisy(name, INSTRUMENTS[name][1])
-    with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
+    reduced(noisy(name, INSTRUMENTS[name][1]), tmp_path / "m.h5")
     with Product(tmp_path / "m.h5") as product:
         shown = " ".join(titles(product))
     assert re.findall(r"S_\d / S_0", shown) == ["S_1 / S_0", "S_2 / S_0", "S_3 / S_0"]
@@ -322,29 +311,26 @@ def test_a_stokes_polarimeter_has_a_figure_of_the_stokes_vector(noisy, tmp_path)
 
 
 def test_the_figure_of_a_partial_mueller_image_says_what_is_not_determined(noisy, tmp_path):
-    path, model, _ = noisy("linear_mueller", INSTRUMENTS["linear_mueller"][1])
-    with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
+    reduced(noisy("linear_mueller", INSTRUMENTS["linear_mueller"][1]), tmp_path / "m.h5")
     with Product(tmp_path / "m.h5") as product:
         texts = [text.get_text() for panel in product_figure(product).axes for text in panel.texts]
     assert texts.count("not\ndetermined") == 7
 
 
 def test_states_that_see_less_than_the_instrument_can_are_refused(noisy, tmp_path):
-    path, model, _ = noisy("rotating_retarder_stokes", {"psa": np.array([0.0, 90, 180, 270])})
-    with Capture(path) as capture, pytest.raises(NotDetermined, match=r"rank \d, and 4 are needed") as refusal:
-        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
+    capture = noisy("rotating_retarder_stokes", {"psa": np.array([0.0, 90, 180, 270])})
+    with pytest.raises(NotDetermined, match=r"rank \d, and 4 are needed") as refusal:
+        reduced(capture, tmp_path / "m.h5")
     # Nothing of elements that it never sees, nor of angles of two retarders.
     assert "m30" in str(refusal.value)
     assert not any(word in str(refusal.value) for word in ("m01", "4.91"))
 
 
 def test_what_needs_the_whole_matrix_says_so(noisy, configs, tmp_path):
-    path, model, _ = noisy("rotating_analyzer", INSTRUMENTS["rotating_analyzer"][1])
-    with Capture(path) as capture:
-        with pytest.raises(ProcessError, match="3 of 16 numbers"):
-            reduce_mueller(capture, model, tmp_path / "p.h5", (Step("reduce", {}),), choice=Choice(physical="nearest"))
-        reduce_mueller(capture, model, tmp_path / "m.h5", STEPS)
+    capture = noisy("rotating_analyzer", INSTRUMENTS["rotating_analyzer"][1])
+    with pytest.raises(ProcessError, match="3 of 16 numbers"):
+        reduced(capture, tmp_path / "p.h5", physical="nearest")
+    reduced(capture, tmp_path / "m.h5")
     with pytest.raises(ProductError, match="determines m00, m10, m20, and this needs all 16"):
         xi0_of_mueller(tmp_path / "m.h5", tmp_path / "x.h5", Step("xi0", {}), False, progress=None)
     for refused in (
@@ -395,6 +381,6 @@ def test_a_sample_that_does_not_see_the_train_does_not_calibrate_it(synthetic_ca
 
 
 def test_as_many_states_as_unknowns_leave_nothing_to_diagnose(noisy):
-    path, model, _ = noisy("rotating_retarder_stokes", {"psa": np.array([-51.7, -15.1, 15.1, 51.7])})
+    path, model = noisy("rotating_retarder_stokes", {"psa": np.array([-51.7, -15.1, 15.1, 51.7])})
     with pytest.raises(CaptureError, match="Take more states"):
         diagnose_captures([path], model)
