@@ -115,8 +115,7 @@ def test_the_wheel_works_where_there_is_no_checkout(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("typed", "meant"),
-    [("aquire", "acquire"), ("proces", "process"), ("veiw", "view"), ("reduce", None), ("x", None)],
+    ("typed", "meant"), [("aquire", "acquire"), ("proces", "process"), ("veiw", "view"), ("reduce", None), ("x", None)]
 )
 def test_lab_asks_whether_a_command_near_by_was_meant(typed: str, meant: str | None) -> None:
     done = subprocess.run([ROOT / "lab", typed], capture_output=True, text=True, check=False)

@@ -187,10 +187,7 @@ def test_a_camera_is_found_by_serial_number_or_alone(loopback: Loopback, device:
 
 
 def test_a_camera_that_is_not_there_is_named_with_those_that_are() -> None:
-    with (
-        GigeCamera("LOOP1", 8, 4, counting),
-        pytest.raises(CameraNotFound, match=r"WRONG7.*LOOP1.*127\.0\.0\.1"),
-    ):
+    with GigeCamera("LOOP1", 8, 4, counting), pytest.raises(CameraNotFound, match=r"WRONG7.*LOOP1.*127\.0\.0\.1"):
         aravis.open("camera", aravis.Config(device="WRONG7"), patient_clock())
 
 

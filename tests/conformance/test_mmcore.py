@@ -227,8 +227,7 @@ class TestCameraOfTheCore(CameraConformance):
         return CoreTwin(self._core, show)
 
     @pytest.mark.parametrize(
-        "wrong",
-        [{"gain_db": 3.0}, {"trigger": "hardware"}, {"width": 100, "offset_x": 40}, {"reverse_x": True}],
+        "wrong", [{"gain_db": 3.0}, {"trigger": "hardware"}, {"width": 100, "offset_x": 40}, {"reverse_x": True}]
     )
     def test_what_the_core_has_no_name_for_is_refused(self, twin: CameraTwin, wrong: dict[str, Any]) -> None:
         with self.open(twin.entry) as camera, pytest.raises(SettingRefused):

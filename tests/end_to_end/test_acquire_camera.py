@@ -74,11 +74,7 @@ def test_darks_that_are_not_dark_end_the_capture(
 
 
 def test_a_rig_with_a_hardware_trigger_captures_with_it(
-    acquire: Acquire,
-    small_rig: Rig,
-    short_plan: Callable[[str], Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cameras: list[GigeCamera] = []
     start, arm = GigeCamera.start, AravisCamera._do_trigger

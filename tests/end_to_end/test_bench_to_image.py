@@ -94,8 +94,7 @@ def test_stokes_capture_without_arm_angle(configs: Path, synthetic_capture, tmp_
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("sample", "omega", "expected"),
-    [("air", 180, np.eye(4)), ("mirror", 10, np.diag([1.0, 1.0, -1.0, -1.0]))],
+    ("sample", "omega", "expected"), [("air", 180, np.eye(4)), ("mirror", 10, np.diag([1.0, 1.0, -1.0, -1.0]))]
 )
 def test_known_samples(sample: str, omega: int, expected: np.ndarray, acquire, small_rig, tmp_path: Path) -> None:
     out = acquire.made("--sample", sample, "--omega", omega, "--rig", small_rig(), "--out", tmp_path)

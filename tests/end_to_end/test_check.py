@@ -60,10 +60,7 @@ def test_what_changed_since_is_named_and_kept(air, process, tmp_path, monkeypatc
     assert azimuth == pytest.approx(0.5, abs=0.02)
     with table.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [(row["capture"], row["verdict"]) for row in rows] == [
-        ("day_2.h5", "unchanged"),
-        ("day_3.h5", "changed"),
-    ]
+    assert [(row["capture"], row["verdict"]) for row in rows] == [("day_2.h5", "unchanged"), ("day_3.h5", "changed")]
     # M of a retarder turned by 0.5 degrees: about 2 sin(4 x 0.25 degrees).
     assert abs(float(rows[1]["m12"])) > 0.01
     assert abs(float(rows[0]["m12"])) < 5 * float(rows[0]["m12_error"])

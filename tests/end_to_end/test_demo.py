@@ -17,9 +17,7 @@ from processing.yaml_file import ConfigError
 PICTURED = 11
 SEEDS = range(1, 21) if os.environ.get("UMOV_SLOW") else (PICTURED,)
 #: Defects of the diagnosis that the demo has found (docs/studies/demo.md); remove a seed whose run passes.
-KNOWN = {
-    3: "two true faults cancel in M: the exact value of one alone makes M worse; the reported chance is 0.09",
-}
+KNOWN = {3: "two true faults cancel in M: the exact value of one alone makes M worse; the reported chance is 0.09"}
 CASES = [
     pytest.param(k, marks=pytest.mark.xfail(reason=KNOWN[k], strict=True, raises=AssertionError) if k in KNOWN else ())
     for k in SEEDS

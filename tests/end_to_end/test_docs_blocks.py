@@ -216,8 +216,7 @@ def run_page(
 
 
 @pytest.mark.parametrize(
-    "page",
-    [pytest.param(p, id=p.stem, marks=[pytest.mark.long] if p.stem in LONG else []) for p in WITH_CODE],
+    "page", [pytest.param(p, id=p.stem, marks=[pytest.mark.long] if p.stem in LONG else []) for p in WITH_CODE]
 )
 def test_commands_and_python_run_as_they_stand(page: Path, run_page: Callable[[Path], None]) -> None:
     run_page(page)

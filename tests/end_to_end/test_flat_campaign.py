@@ -21,10 +21,7 @@ from tests.rig_files import write_rig
 # The campaign that all of them share is what takes its time.
 pytestmark = pytest.mark.long
 SHAPE = (96, 112)
-UNDECLARED = [
-    {"kind": "pixel_response", "sigma": 0.05},
-    {"kind": "uneven_light", "corner_loss": 0.4, "gradient": 0.3},
-]
+UNDECLARED = [{"kind": "pixel_response", "sigma": 0.05}, {"kind": "uneven_light", "corner_loss": 0.4, "gradient": 0.3}]
 OMEGAS = (40, 50, 60)
 
 

@@ -16,9 +16,6 @@ def test_hardware_suite_passes_on_a_served_rig(small_rig, acquire, tmp_path):
         assert acquire("move", "arm", 35, "--rig", rig)[0] == 0
         options = ["-q", "-p", "no:cacheprovider", "-o", "addopts=--import-mode=importlib", "--rig", str(rig)]
         run = subprocess.run(
-            [sys.executable, "-m", "pytest", "tests/hardware", *options],
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
+            [sys.executable, "-m", "pytest", "tests/hardware", *options], cwd=ROOT, capture_output=True, text=True
         )
     assert "4 passed" in run.stdout, run.stdout + run.stderr

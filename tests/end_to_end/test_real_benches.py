@@ -15,15 +15,7 @@ from simulators.blind.bench_oracle import read_oracle
 from simulators.blind.bench_run import judge_bench
 from simulators.blind.bench_table import MATTERS, is_worse, reliability, sure_and_wrong, table
 from simulators.blind.mueller_error import Reduced, coverage_of, error_of
-from simulators.blind.real_bench import (
-    GROUPS,
-    MOSAIC,
-    RGB950,
-    RealBench,
-    TrueFault,
-    make_bench,
-    read_truth,
-)
+from simulators.blind.real_bench import GROUPS, MOSAIC, RGB950, RealBench, TrueFault, make_bench, read_truth
 from simulators.blind.reliability_diagram import draw
 from simulators.blind.undeclared_captures import TrueScene, declared_bench, digitize, expose, state_angles
 

@@ -179,10 +179,7 @@ def test_the_dry_run_looks_at_the_way_between_captures(rig_with, tmp_path, endle
 
 
 # Round a box of two rotators: up on one side, across, and down on the other.
-AROUND = {
-    "psg": [10.0, 10, 10, 10, 60, 110, 110, 110, 110],
-    "psa": [10.0, 60, 90, 130, 130, 130, 90, 60, 10],
-}
+AROUND = {"psg": [10.0, 10, 10, 10, 60, 110, 110, 110, 110], "psa": [10.0, 60, 90, 130, 130, 130, 90, 60, 10]}
 BLOCK = pose(psg=[20, 100], psa=[-5, 120])
 
 

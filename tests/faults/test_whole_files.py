@@ -18,10 +18,7 @@ from processing.whole_file import whole_file, write_new_text, write_whole_text
 from tests.commands import exit_code
 
 SHAPE = (20, 30)
-WRITERS = {
-    **{to: ("export", "--to", to) for to in ("csv", "tiff", "mat", "fits", "png")},
-    "html": ("report",),
-}
+WRITERS = {**{to: ("export", "--to", to) for to in ("csv", "tiff", "mat", "fits", "png")}, "html": ("report",)}
 ENDINGS = {"tiff": ".mueller.tif"}
 
 

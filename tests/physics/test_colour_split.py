@@ -36,12 +36,7 @@ def test_each_colour_has_its_four_analyzers(synthetic_capture, tmp_path: Path, t
         channels=("mosaic",),
     )
     parts, _ = split_colours(path, tmp_path / "parts")
-    assert {p.suffixes[0][1:] for p in parts} == {
-        "red",
-        "green_a",
-        "green_b",
-        "blue",
-    }
+    assert {p.suffixes[0][1:] for p in parts} == {"red", "green_a", "green_b", "blue"}
     for part in parts:
         name = part.suffixes[0][1:].partition("_")[0]
         with Capture(part) as capture:

@@ -23,8 +23,7 @@ ANGLES = {"psg": 4.7 * np.arange(24), "psa": 23.1 * np.arange(24)}
 
 
 @pytest.mark.parametrize(
-    ("kind", "unknowns", "darks", "stated"),
-    [("air", 1, 2, True), ("unknown", 16, 2, True), ("air", 1, 1, False)],
+    ("kind", "unknowns", "darks", "stated"), [("air", 1, 2, True), ("unknown", 16, 2, True), ("air", 1, 1, False)]
 )
 def test_noise_of_few_darks_is_expected_in_the_residual(kind, unknowns, darks, stated, synthetic_capture, configs):
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)

@@ -173,11 +173,7 @@ def test_files_go_and_come_in_a_copy(tmp_path, configs):
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
     )
-    assert run.stdout.splitlines() == [
-        str(tmp_path / "processing"),
-        "dimmer psg_azimuth",
-        "arm_zero skew",
-    ], run.stderr
+    assert run.stdout.splitlines() == [str(tmp_path / "processing"), "dimmer psg_azimuth", "arm_zero skew"], run.stderr
 
 
 def test_a_plug_in_is_found_for_both_kinds(monkeypatch):

@@ -280,11 +280,7 @@ def test_bad_layouts_and_frames() -> None:
 
 
 @pytest.mark.parametrize(
-    ("dtype", "arrangement"),
-    [
-        (np.uint16, (("0", "135"), ("45", "90"))),
-        (np.float32, (("90", "45"), ("135", "0"))),
-    ],
+    ("dtype", "arrangement"), [(np.uint16, (("0", "135"), ("45", "90"))), (np.float32, (("90", "45"), ("135", "0")))]
 )
 def test_one_pass_equals_the_long_way(dtype: type, arrangement: tuple[tuple[str, ...], ...]) -> None:
     layout = MosaicLayout.of(arrangement, NAMES, ANALYZERS)

@@ -31,10 +31,7 @@ CLOSED_FORM: list[Group] = [
     gradients.differential_quantities,
     with_pairs,
 ]
-NUMERIC: list[Group] = [
-    gradients.dominant,
-    gradients.lu_chipman_quantities,
-]
+NUMERIC: list[Group] = [gradients.dominant, gradients.lu_chipman_quantities]
 
 
 def scalar_group(scalar: Scalar) -> Group:

@@ -30,10 +30,7 @@ def make(synthetic_capture, configs: Path):
         electrons = rng.poisson((w @ truth)[:, None, None, None], size=(40, 1, 40, 50))
         counts = np.clip(np.round(electrons + rng.normal(0, 2, electrons.shape) + 100 + offset), 0, 65535)
         path = synthetic_capture(
-            counts.astype(np.uint16),
-            dict(table.angles_deg),
-            instrument_yaml=instrument.read_text(),
-            detector=DETECTOR,
+            counts.astype(np.uint16), dict(table.angles_deg), instrument_yaml=instrument.read_text(), detector=DETECTOR
         )
         return path, (counts == 0).mean(axis=(1, 2, 3)) > 0.01
 

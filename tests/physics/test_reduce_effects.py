@@ -49,10 +49,7 @@ def capture_of(write, signal: np.ndarray) -> Path:
 
 @pytest.mark.parametrize(
     ("kind", "element", "parameters"),
-    [
-        ("psg_azimuth", "psg_retarder", {"error_deg": 1.5}),
-        ("psa_retardance", "psa_retarder", {"error_deg": 3.0}),
-    ],
+    [("psg_azimuth", "psg_retarder", {"error_deg": 1.5}), ("psa_retardance", "psa_retarder", {"error_deg": 3.0})],
 )
 def test_effects_of_the_optics_go_into_w(
     kind: str, element: str, parameters: dict[str, float], rgb950: InstrumentModel, synthetic_capture

@@ -51,9 +51,7 @@ def test_a_gsc_02_is_driven_by_a_letter_without_a_colon() -> None:
 
 def test_a_disturbed_blank_in_a_status_of_a_gsc_is_asked_for_again() -> None:
     with scripted(
-        (b"?:V\r\n", b"V1.10\r\n"),
-        (b"Q:\r\n", b"-\x1c     400,K,K,R\r\n"),
-        (b"Q:\r\n", b"-      400,K,K,R\r\n"),
+        (b"?:V\r\n", b"V1.10\r\n"), (b"Q:\r\n", b"-\x1c     400,K,K,R\r\n"), (b"Q:\r\n", b"-      400,K,K,R\r\n")
     ) as (path, lines):
         gsc.open("psg", gsc.Config(port=path, rtscts=False, reply_s=0.2), lines)
 

@@ -288,10 +288,7 @@ def test_gsc_sets_a_move_and_drives_it() -> None:
 
 
 def test_a_gsc_stops_at_the_end_of_its_travel_and_says_so() -> None:
-    for kind, status in (
-        ("gsc-01", b"      4000,K,L,R\r\n"),
-        ("gsc-02", b"      4000,         0,K,L,R\r\n"),
-    ):
+    for kind, status in (("gsc-01", b"      4000,K,L,R\r\n"), ("gsc-02", b"      4000,         0,K,L,R\r\n")):
         box, clock = emulator(kind, limits_deg=(-10.0, 10.0))
         box.axes[0].call_position(0.0)
         for text in (b"M:1+P8000\r\n", b"G:\r\n" if kind == "gsc-01" else b"G\r\n"):

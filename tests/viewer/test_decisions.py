@@ -40,10 +40,7 @@ def diagnosed(lab, drr_capture):
         {"kind": "psa_azimuth", "element": "psa_retarder", "parameters": {"azimuth": {"value": 0.5, "unit": "degree"}}}
     )
     diagnosis = Diagnosis(
-        **FOUND,
-        effects=(),
-        recommendation="Capture <b>air</b>.",
-        correction=Correction(effects=(effect,)),
+        **FOUND, effects=(), recommendation="Capture <b>air</b>.", correction=Correction(effects=(effect,))
     )
     (folder / "diagnosis.json").write_text(diagnosis.model_dump_json())
     return name
