@@ -20,16 +20,10 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.posterior import Say
 from processing.diagnosis.search.range_of import NEARLY_ZERO
-from processing.diagnosis.search.rules import FAR_OFF, LITTLE
+from processing.diagnosis.search.rules import FAR_OFF, LITTLE, NOMINAL_DEG
 from processing.diagnosis.search.space import Space
 from processing.instrument.elements import number
 
-#: [of the signal] Residual below which no better start is looked for.
-NEAR_ENOUGH = 0.01
-#: [degree] Half width of the starts of retardances of plates of a known order; and size from which on values have any.
-NEAR_DEG = 20.0
-#: [degree] The same of elements of which no more than "some retardance" is known.
-FAR_DEG = 120.0
 #: [places] From which nominal values are fitted.
 STARTS = 24
 
@@ -149,67 +143,42 @@ def _excess(problem: InstrumentProblem, values: Values) -> float:
 def first_values(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate], say: Say) -> Values:
     """Values to begin with, of the nominal values and of what else was found beside them."""
     fit = minimize(problem, base, np.zeros(base.size))
-    several = base.size and len(set(problem.wavelengths_nm)) > 1
-    # Curves over the wavelengths have more valleys than the values at one of them.
-    if fit.rms < (NEAR_ENOUGH if several else FAR_OFF) or not any(c.effect.is_nominal for c in base.candidates):
+    if fit.rms < FAR_OFF or not any(c.effect.is_nominal for c in base.candidates):
         return base.split(fit.values)
     say("far off: searching from many starts")
-    if not several:
-        return _search(problem, base, pool, fit)
-    estimates = along_wavelengths(problem, base, say)
-    space = Space(tuple(estimates))
-    sums = problem.sums(space, space.vector(estimates), derivatives=False)
-    return estimates if sums.excess.sum() < fit.excess else base.split(fit.values)
-
-
-def _search(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate], fit: Fit) -> Values:
+    if len(set(problem.wavelengths_nm)) > 1:
+        estimates = along_wavelengths(problem, base, say)
+        space = Space(tuple(estimates))
+        sums = problem.sums(space, space.vector(estimates), derivatives=False)
+        return estimates if sums.excess.sum() < fit.excess else base.split(fit.values)
     # Nominal values are not found beside a source or channels that are as far off.
     free = [c for c in pool if c.effect.of_channels or (c.effect.of_source and c.effect.per_state)]
     wide = Space((*base.candidates, *free))
-    values = np.concatenate([fit.values, np.zeros(wide.size - base.size)])
-    return wide.split(_best_start(problem, wide, values, fit.excess, starts=STARTS))
+    return wide.split(best_of_starts(problem, wide, np.append(fit.values, np.zeros(wide.size - base.size))).values)
 
 
-def best_of_starts(problem: InstrumentProblem, space: Space, starts: int, begin: Array | None = None) -> Fit:
-    """The best fit of nominal values alone, from `begin` (K,) and, where that is far off, so many places about it."""
-    fit = minimize(problem, space, np.zeros(space.size) if begin is None else begin)
-    if fit.rms < FAR_OFF or not starts:
-        return fit
-    return minimize(
-        problem,
-        space,
-        _best_start(problem, space, fit.values, fit.excess, starts=starts, enough=NEAR_ENOUGH),
-        expansions=0,
-    )
+def best_of_starts(
+    problem: InstrumentProblem, space: Space, begin: Array | None = None, free: BoolArray | None = None
+) -> Fit:
+    """The best fit from `begin` (K,) and, as long as that is far off, from many places about zero.
 
-
-def _best_start(
-    problem: InstrumentProblem,
-    space: Space,
-    values: Array,
-    best: float,
-    *,
-    starts: int,
-    enough: float = 0.0,
-    free: BoolArray | None = None,
-) -> Array:
-    """The best of fits from `values` and from many places about zero, if one leaves less than `best`.
-
-    `enough` : relative rms residual below which no better start is looked for. `free` (K,) : what is fitted.
+    `free` (K,) : what is fitted.
     """
-    random, start = np.random.default_rng(0), values
-    for k in range(starts + 1):
-        width = _widths(space, NEAR_DEG if k % 2 else FAR_DEG)
-        point = random.uniform(-1, 1, space.size) * width if k else start
-        tried = minimize(problem, space, point, expansions=0, free=free)
-        if tried.excess < best:
-            values, best = tried.values, tried.excess
-            if tried.rms < enough:
-                break
-    return values
+    random, best = (
+        np.random.default_rng(0),
+        minimize(problem, space, space.vector({}) if begin is None else begin, free=free),
+    )
+    for k in range(STARTS):
+        if best.rms < FAR_OFF:
+            break
+        point = random.uniform(-1, 1, space.size) * _widths(space, 180.0 if k % 2 else NOMINAL_DEG)
+        best = min(best, minimize(problem, space, point, expansions=0, free=free), key=lambda fit: fit.excess)
+    return best
 
 
 def _widths(space: Space, retardance: float) -> Array:
+    """Half widths (K,), degrees, of the starts: retardances of plates of a known order are near what is declared."""
+
     def width(candidate: Candidate) -> float:
         if not _anywhere(candidate):
             return 0.0
@@ -221,82 +190,49 @@ def _widths(space: Space, retardance: float) -> Array:
 
 def _anywhere(candidate: Candidate) -> bool:
     """A nominal value that may be far off: no window, no diattenuation."""
-    return candidate.effect.is_nominal and candidate.parameters[0].typical >= NEAR_DEG
+    return candidate.effect.is_nominal and candidate.parameters[0].typical >= NOMINAL_DEG
 
 
 def along_wavelengths(problem: InstrumentProblem, base: Space, say: Say) -> Values:
-    """One wavelength from many starts, the others one after the other as their neighbours point, then all together."""
+    """One wavelength from many starts, each other one from the values of its neighbour, then all together."""
     wavelengths = sorted(set(problem.wavelengths_nm))
     space = Space((*base.candidates, *(c for c in problem.pool() if c.effect.of_channels)))
-    each = [_AtOne(problem.at(w), space, w) for w in wavelengths]
-    best: Fit | None = None
+    problems, fits = [problem.at(w) for w in wavelengths], []
     for first in (len(wavelengths) // 2, 0, len(wavelengths) - 1):
-        solutions: dict[int, Values] = {first: each[first].search_starts()}
-        for k in range(first + 1, len(wavelengths)):
-            solutions[k] = each[k].beside(_pointed_to(solutions, each, k, (k - 1, k - 2)))
-        for k in reversed(range(first)):
-            solutions[k] = each[k].beside(_pointed_to(solutions, each, k, (k + 1, k + 2)))
-        fit = minimize(problem, space, _join(space, [solutions[k] for k in range(len(wavelengths))]))
-        say(f"beginning at {wavelengths[first]:g} nm: {100 * fit.rms:.3g} %")
-        if best is None or fit.excess < best.excess:
-            best = fit
-        if best.rms < FAR_OFF:
+        solutions: dict[int, Values] = {}
+        for k in sorted(range(len(wavelengths)), key=lambda k: abs(k - first)):
+            neighbour = solutions.get(k - 1 if k > first else k + 1)
+            solutions[k] = _at_one(problems[k], space.acting(0, wavelengths[k]).space, neighbour)
+        fits.append(minimize(problem, space, _join(space, [solutions[k] for k in sorted(solutions)])))
+        say(f"beginning at {wavelengths[first]:g} nm: {100 * fits[-1].rms:.3g} %")
+        if fits[-1].rms < FAR_OFF:
             break
     else:
         say("no mounts fit all wavelengths: were they homed anew in between? Then give each run by itself")
-    return {} if best is None else space.split(best.values)
+    return space.split(min(fits, key=lambda fit: fit.excess).values)
 
 
-class _AtOne:
-    """Nominal values and gains of the channels at one wavelength, windows and diattenuations left as they are."""
+def _at_one(problem: InstrumentProblem, space: Space, neighbour: Values | None) -> Values:
+    """Nominal values and gains of the channels at one wavelength, windows and diattenuations left as they are.
 
-    def __init__(self, problem: InstrumentProblem, space: Space, wavelength_nm: float) -> None:
-        self.problem, self.wavelength_nm = problem, wavelength_nm
-        self.space = space.acting(0, wavelength_nm).space
-
-        candidates = self.space.candidates
-        large = (_anywhere(c) or not c.effect.is_nominal for c in candidates for _ in c.parameters)
-        self._large = np.array(list(large))
-
-    def search_starts(self) -> Values:
-        """From many starts, where it is far off."""
-        fit = minimize(self.problem, self.space, np.zeros(self.space.size), free=self._large)
-        values = fit.values
-        if fit.rms > NEAR_ENOUGH:
-            values = _best_start(
-                self.problem, self.space, values, fit.excess, starts=STARTS, enough=NEAR_ENOUGH, free=self._large
-            )
-        return self.space.split(values)
-
-    def beside(self, start: Mapping[str, Array]) -> Values:
-        """From values of the same places; what the wavelengths share is held."""
-        is_own = np.array([c.wavelength_nm is not None for c in self.space.candidates for _ in c.parameters])
-        values = np.concatenate([start[c.short] for c in self.space.candidates])
-        fit = minimize(self.problem, self.space, values, free=is_own & self._large)
-        return self.space.split(fit.values)
-
-
-def _pointed_to(
-    solutions: Mapping[int, Values], each: Sequence[_AtOne], k: int, neighbours: tuple[int, int]
-) -> dict[str, Array]:
-    """Values by place at wavelength k, on the line through two neighbours over the reciprocal of the wavelength."""
-    near = {c.short: v for c, v in solutions[neighbours[0]].items()}
-    if neighbours[1] not in solutions:
-        return near
-    far = {c.short: v for c, v in solutions[neighbours[1]].items()}
-    at, near_at, far_at = (1 / each[i].wavelength_nm for i in (k, *neighbours))
-    share = (at - near_at) / (near_at - far_at)
-    return {place: v + share * (v - far[place]) for place, v in near.items()}
+    From many starts, or from those of a neighbour: then what the wavelengths share is held.
+    """
+    large = np.array([_anywhere(c) or not c.effect.is_nominal for c in space.candidates for _ in c.parameters])
+    if neighbour is None:
+        return space.split(best_of_starts(problem, space, free=large).values)
+    is_own = np.array([c.wavelength_nm is not None for c in space.candidates for _ in c.parameters])
+    near = {c.short: v for c, v in neighbour.items()}
+    values = np.concatenate([near[c.short] for c in space.candidates])
+    return space.split(minimize(problem, space, values, free=is_own & large).values)
 
 
 def _join(space: Space, solutions: Sequence[Values]) -> Array:
     """Values of the common vector, of those at each wavelength in ascending order."""
     parts = []
     for candidate in space.candidates:
-        at = np.stack([v for each in solutions for c, v in each.items() if c.short == candidate.short])
         if candidate.curve is not None:
-            parts.append(candidate.curve.through(at))
+            at = [v for each in solutions for c, v in each.items() if c.short == candidate.short]
+            parts.append(candidate.curve.through(np.stack(at)))
         else:
-            matches = [v for each in solutions for c, v in each.items() if c == candidate]
-            parts.append(matches[0])
+            parts.append(next(each[candidate] for each in solutions if candidate in each))
     return np.concatenate(parts)

@@ -8,13 +8,13 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.features import MARGIN
-from processing.diagnosis.instrument.initial_values import best_of_starts, first_values, nearest_branch
+from processing.diagnosis.instrument.initial_values import first_values, nearest_branch
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.photon_noise import exactly_undone
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.correction import applied
-from processing.diagnosis.search.fit import Fit, prior, score
+from processing.diagnosis.search.fit import Fit, minimize, prior, score
 from processing.diagnosis.search.likely_set import everything
 from processing.diagnosis.search.posterior import Posterior, Say, fit_posterior
 from processing.diagnosis.search.rules import EXACT, FAR_OFF, NEEDED, TAKES_PART
@@ -89,7 +89,7 @@ class WholeBench:
         space = Space(tuple(start))
         values = space.vector(start)
         if not beside:
-            values = best_of_starts(self.whole, space, 0, values).values
+            values = minimize(self.whole, space, values).values
         return Fit(values, self.whole.sums(space, values, derivatives=False), 0.0).rms > FAR_OFF
 
     def run(self) -> Posterior:

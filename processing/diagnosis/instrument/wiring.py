@@ -18,15 +18,13 @@ from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.instrument.initial_values import best_of_starts
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.fit import minimize
-from processing.diagnosis.search.rules import NEEDED, OUTSTANDING
+from processing.diagnosis.search.rules import LIMIT, NEEDED
 from processing.diagnosis.search.space import Space
 from processing.effect import EffectError
 from processing.instrument.model import InstrumentModel
 
 #: [1] Factor by which less must be left over without a mistake of wiring: no small change of a value does that.
 WIRING = 5.0
-#: [places] From which nominal values are fitted for each mistake.
-FEW_STARTS = 5
 
 #: [1, fixed] Ratios of two gears that are taken for one another in rotating-retarder polarimeters.
 GEARS = {"5 instead of 4.91": 5 / 4.91, "4.91 instead of 5": 4.91 / 5}
@@ -75,7 +73,7 @@ def find_train_miswiring(problem: InstrumentProblem, declared: InstrumentModel |
     mistakes = list(_possible(problem, declared))
 
     def chi2(tried: InstrumentProblem) -> float:
-        return _chi2(tried, base, best_of_starts(tried, base, FEW_STARTS).values)
+        return _chi2(tried, base, best_of_starts(tried, base).values)
 
     return _best(mistakes, [chi2(w.problem.undivided()) for w in mistakes], chi2(problem.undivided()))
 
@@ -91,7 +89,7 @@ def _chi2(problem: InstrumentProblem, space: Space, values: Array) -> float:
     excess, freedom = float(sums.excess.sum()), float(sums.freedom.sum())
     if not problem.noise_known:
         return excess + freedom
-    return max(excess, 0.0) + OUTSTANDING * float(np.sqrt(2 * max(freedom, 1.0) * problem.spread))
+    return max(excess, 0.0) + LIMIT * float(np.sqrt(2 * max(freedom, 1.0) * problem.spread))
 
 
 def _possible(problem: InstrumentProblem, declared: InstrumentModel | None) -> Iterator[Wiring]:
