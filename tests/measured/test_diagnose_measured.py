@@ -123,7 +123,9 @@ def test_terms_of_even_wavelengths_predict_whole_states_of_odd_ones(public_files
         others = [g for g in range(bench.problem.folds) if g != f]
         values = minimize(bench.problem, space, start, others, weak=weak).values
         for k, capture in enumerate(bench.problem.captures):
-            told = (bench.problem.rows(k, space, values) @ capture.sample).reshape(-1, 2)
+            told = (
+                capture.matrix_of(bench.problem.models[k], bench.problem.changes(k, space, values)) @ capture.sample
+            ).reshape(-1, 2)
             seen = capture.signal
             for c, part in space.pairs:
                 if c.is_pointwise:

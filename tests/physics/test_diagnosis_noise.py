@@ -8,7 +8,7 @@ from processing.diagnosis.captures.unstated_noise import estimated_noise
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block, noise_information
-from processing.diagnosis.instrument.structure import Images, Residual, _tests, descriptions
+from processing.diagnosis.instrument.structure import Residual, _tests, descriptions
 from processing.diagnosis.search.linearization import _with_noise_of_counts
 from processing.diagnosis.search.space import Sums
 
@@ -60,8 +60,8 @@ def test_tests_of_pure_noise_scatter_by_one_standard_deviation():
     scores = []
     for _ in range(100):
         residual = np.tensordot(outside, random.normal(size=(rows, side, side)), 1).astype(np.float32)
-        images = Images(residual, around, expected, np.ones((side, side), dtype=bool))
-        tests, _ = _tests(images, np.ones(rows), np.zeros((rows, 2)), 16, spread=1.0, noise_known=True)
+        noise = {"shown": np.ones(rows), "alike": np.zeros((rows, 2)), "columns": 16, "spread": 1.0}
+        tests, _ = _tests(residual, around, expected, np.ones((side, side), dtype=bool), **noise)
         scores.append([value for name, value in tests.items() if name != "sum of squares"])
     assert len(scores[0]) == 5
     assert np.std(scores, axis=0) == pytest.approx(np.ones(5), abs=0.25)

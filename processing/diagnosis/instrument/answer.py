@@ -6,7 +6,6 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES, features
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import Residual
-from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import CaptureReport, NoiseReport, NotMeasured
@@ -59,11 +58,6 @@ def _by_wavelength(values: dict[float, tuple[float, float]], unit: str) -> Effec
     if len(set(value)) == 1:
         return EffectParameter(value=value[0], stderr=stderr[0], unit=unit)
     return EffectParameter(value=value, stderr=stderr, unit=unit, wavelengths_nm=at)
-
-
-def missing(unseen: list[Candidate]) -> list[Candidate]:
-    """Unobservable candidates that another sample could show."""
-    return [c for c in unseen if not (c.acts_on_counts or c.effect.varies_over_image)]
 
 
 def capture_report(

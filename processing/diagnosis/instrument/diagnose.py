@@ -12,7 +12,7 @@ from processing.computing.blas import one_blas_thread
 from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.captures.screening import screen_capture
-from processing.diagnosis.instrument.answer import calibrated, capture_report, missing, noise_report, not_measured
+from processing.diagnosis.instrument.answer import calibrated, capture_report, noise_report, not_measured
 from processing.diagnosis.instrument.doubts import doubts, find_changed, testable
 from processing.diagnosis.instrument.mueller_error import MuellerErrors, chances, lasts
 from processing.diagnosis.instrument.problem import InstrumentProblem
@@ -20,14 +20,13 @@ from processing.diagnosis.instrument.recommend import recommended
 from processing.diagnosis.instrument.structure import Residual, compute_residual, descriptions
 from processing.diagnosis.instrument.whole_bench import WholeBench, validation_problem
 from processing.diagnosis.instrument.wiring import Wiring, find_miswiring, find_train_miswiring
-from processing.diagnosis.search.causes import causes, observable_effects
+from processing.diagnosis.search.causes import Names, causes, observable_effects
 from processing.diagnosis.search.correction import solution
 from processing.diagnosis.search.decision import Judgement, beyond_chance
 from processing.diagnosis.search.fit import Solution
-from processing.diagnosis.search.names import Names
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis
-from processing.diagnosis.search.rules import FAR_OFF, LIKELY, OUTSTANDING, SURE
+from processing.diagnosis.search.rules import FAR_OFF, LIKELY, LIMIT, SURE
 from processing.diagnosis.verdict.answer import Answer, checks, effects_of_switches, unobservable
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture, CaptureError
@@ -41,11 +40,11 @@ def has_structure(problem: InstrumentProblem, r: Residual) -> bool:
 def white(r: Residual) -> bool:
     """Whether the mean residual of a state tells nothing of that of the next one."""
     mean = r.mean[np.isfinite(r.mean)]
-    if mean.size <= OUTSTANDING**2 or not np.any(mean):
+    if mean.size <= LIMIT**2 or not np.any(mean):
         return True
     centred = mean - mean.mean()
     lag = float(centred[1:] @ centred[:-1] / (centred @ centred))
-    return bool(abs(lag) * np.sqrt(mean.size) < OUTSTANDING)
+    return bool(abs(lag) * np.sqrt(mean.size) < LIMIT)
 
 
 def names_of(problem: InstrumentProblem, posterior: Posterior, solved: Solution, excess: float) -> Names:
@@ -113,7 +112,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     is_known = judgement.refused is None or not nominal or (judgement.first is None and solved.before.rms < FAR_OFF)
     diagnosis = Diagnosis(
         **answer.fields(
-            recommended=lambda: recommended(problem, final.space, final.fit, names.rivals, unseen=missing(unseen)),
+            recommended=lambda: recommended(problem, final.space, final.fit, names.rivals, unseen=unseen),
             descriptions=descriptions([c.name for c in validation.captures], after),
             captures=[
                 capture_report(validation, k, final, r, after=left)

@@ -10,11 +10,10 @@ from processing.diagnosis.instrument.edges import at_edges
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.unevenness import Evenness
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import Cause, significance
+from processing.diagnosis.search.causes import Cause, significance, with_parts
 from processing.diagnosis.search.fit import Solution
-from processing.diagnosis.search.names import with_parts
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import EDGES, LIMIT, OUTSTANDING, TESTABLE
+from processing.diagnosis.search.rules import EDGES, LIMIT, TESTABLE
 
 #: The image does not move where that would be seen best.
 STANDS = "the edges, which were left out of the fit, do not move as it says"
@@ -100,4 +99,4 @@ def _uneven(even: Evenness, solved: Solution, candidate: Candidate) -> bool:
     if candidate not in solved.space.candidates or any(c.effect.varies_over_image for c in solved.effects):
         return False
     excess, terms = even.varies(candidate)
-    return bool(excess > OUTSTANDING * np.sqrt(2 * terms))
+    return bool(excess > LIMIT * np.sqrt(2 * terms))

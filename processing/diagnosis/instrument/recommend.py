@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.slopes import step_values
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.range_of import least_apart
@@ -16,8 +17,6 @@ from processing.diagnosis.search.rules import APART, LEAST_NOISE, STEP
 from processing.diagnosis.search.space import Space
 from processing.polarization import mueller
 
-#: [sine] By which another sample has to do better than a simpler one to be asked for.
-CLEARLY_MORE = 0.15
 #: Samples that a lab has at hand, in the order of the trouble they make.
 SAMPLES: dict[str, NDArray[np.float64]] = {
     "air (Omega = 180 degrees, nothing at the centre)": np.eye(4),
@@ -37,6 +36,7 @@ def recommended(
     unseen: Sequence[Candidate],
 ) -> str:
     """Next capture: one that separates each indistinguishable set, else one that shows the unseen effects."""
+    unseen = [c for c in unseen if not (c.acts_on_counts or c.effect.varies_over_image)]
     return " ".join(dict.fromkeys(_capture(problem, space, fit, rivals, unseen=unseen) for rivals in sets or ((),)))
 
 
@@ -77,7 +77,7 @@ def _best_sample(
             continue
         value = _power(problem, space, fit, sample, rivals=rivals, unseen=unseen)
         # A simpler sample is preferred unless another one tells clearly more.
-        if value > power + CLEARLY_MORE:
+        if value > power + APART / 2:
             best, power = name, value
     return best, power
 
@@ -106,16 +106,12 @@ def _signature(problem: InstrumentProblem, space: Space, fit: Fit, sample: Array
     part = joint.slices[joint.candidates.index(candidate)]
 
     def signal(values: Array) -> Array:
-        return np.asarray(problem.rows(capture, joint, values) @ sample)
+        w = problem.captures[capture].matrix_of(problem.models[capture], problem.changes(capture, joint, values))
+        return np.asarray(w @ sample)
 
     start = signal(zero)
     scale = np.linalg.norm(start)
     if scale == 0:
         return np.zeros((start.size, candidate.size))
-    columns = []
-    for j in range(candidate.size):
-        moved = zero.copy()
-        moved[part.start + j] += STEP * candidate.typical[j]
-        d = (signal(moved) - start) / STEP
-        columns.append(d - start * (start @ d) / scale**2)
-    return np.stack(columns, axis=1) / scale
+    slopes = np.stack([signal(moved) - start for moved, _ in step_values(candidate, part, zero)], axis=1) / STEP
+    return np.asarray(slopes - np.outer(start, start @ slopes) / scale**2) / scale

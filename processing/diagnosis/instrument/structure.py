@@ -54,23 +54,6 @@ class Residual:
     excess: float = 0.0
 
 
-@dataclass(frozen=True)
-class Images:
-    """Data of the tests, each (L, rows, columns); NaN or zero where a pixel is not used.
-
-    Attributes
-    ----------
-    residual : in units of the noise.
-    around : the fit near by, in counts over full scale; expected : variance of the residual of a smooth pattern.
-    good : (rows, columns) pixels that are used.
-    """
-
-    residual: NDArray[np.float32]
-    around: NDArray[np.float32]
-    expected: NDArray[np.float32]
-    good: NDArray[np.bool_]
-
-
 def compute_residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -> Residual:
     """Residual of a capture at the values of a fit, pixel by pixel, and its tests."""
     problem, values = problem.near(space, fit.values)
@@ -108,9 +91,11 @@ def compute_residual(problem: InstrumentProblem, capture: int, space: Space, fit
     for row, of_row in enumerate(expected):
         of_row *= pixels.variance_of(row) / level[row] ** 2 * per_scale
     good = np.asarray(np.isfinite(r).all(axis=0))
-    images = Images(r, around, expected, good)
-    alike = _neighbour_noise(data)
-    tests, chi2 = _tests(images, moments.shown, alike, a.shape[1], spread=moments.spread, noise_known=data.noise_known)
+    tests: dict[str, float] = {}
+    chi2 = 0.0
+    if data.noise_known and good.any():
+        shown, alike, spread = moments.shown, _neighbour_noise(data), moments.spread
+        tests, chi2 = _tests(r, around, expected, good, shown=shown, alike=alike, columns=a.shape[1], spread=spread)
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
     states = mean.reshape(n, channels).mean(axis=1)
@@ -173,23 +158,23 @@ def _parts(
 
 
 def _tests(
-    images: Images,
+    r: NDArray[np.float32],
+    around: NDArray[np.float32],
+    expected: NDArray[np.float32],
+    good: NDArray[np.bool_],
+    *,
     shown: Array,
     alike: Array,
     columns: int,
-    *,
     spread: float,
-    noise_known: bool,
 ) -> tuple[dict[str, float], float]:
     """Chi-square of each test over its standard deviation, and the largest that is certainly left.
 
-    `shown` (L,) is the part of the noise that single pixels show, `alike` (L, 2) what neighbours down and across share
-    of it.
+    Of a residual r (L, rows, columns) in units of the noise, the fit `around` in counts, and the variance that is
+    `expected` of a smooth pattern, at `good` pixels. `shown` (L,) is the part of the noise that single pixels show,
+    `alike` (L, 2) what neighbours down and across share of it.
     """
-    r, expected, good = images.residual, images.expected, images.good
     count = int(good.sum())
-    if count == 0 or not noise_known:
-        return {}, 0.0
     flat, noise = r[:, good], expected[:, good]
     # Of smooth patterns moved frames keep all the noise, of single pixels only a part.
     freedom = shown @ noise.sum(axis=1, dtype=float)
@@ -199,7 +184,7 @@ def _tests(
         # What goes with the signal, or with the place, needs an image.
         return in_deviations(tests)
     # Linear in the signal: every pixel's residual against the leading components of the fitted signal near by.
-    s = images.around[:, good]
+    s = around[:, good]
     _, size, vt = np.linalg.svd((s @ s.T).astype(float))
     keep = min(columns, int(np.sum(size > RANK * size[0])))
     turned = vt[:keep] / np.sqrt(np.maximum(size[:keep], 1e-300))[:, None]

@@ -1,4 +1,4 @@
-"""Names: the groups that are causes, their probabilities, their alternatives, and the observable effects.
+"""Names: the groups that are causes, their probabilities, alternatives and doubts, and the observable effects.
 
 A correction improves predictions, a name states a cause. Groups with parallel signatures, after projection of all
 other effects, are one class. It can be certain that one of them is present, and open which one.
@@ -6,6 +6,7 @@ other effects, are one class. It can be certain that one of them is present, and
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,11 +17,16 @@ from scipy.special import expit
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import LIKELY, NOMINAL_TAU, OUTSTANDING, SHOWN, SURE
+from processing.diagnosis.search.rules import LIKELY, LIMIT, NEEDED, NOMINAL_TAU, SHOWN, SURE, TIMES
 from processing.diagnosis.search.space import Problem
 
 #: [log odds] By which one of two causes has to be likelier for a sure name.
 LEAST_DIFFERENCE = float(np.log(SURE / (1 - SURE)))
+
+#: Reasons that leave a name likely.
+PART_OF_LEFT = "it may be a part of what is left unexplained"
+PART_OF_UNLISTED = "it may be a part of the fault that has no name"
+PARTS = (PART_OF_LEFT, PART_OF_UNLISTED)
 
 Answer = Literal["sure", "likely", "one of", "unlisted", "unknown"]
 
@@ -134,7 +140,7 @@ def observable_effects(posterior: Posterior) -> tuple[Candidate, ...]:
         if not (candidate.state_chosen or candidate.acts_on_counts)
         and not (candidate.effect.varies_over_image or candidate.effect.is_switch or candidate.effect.per_state)
         and not np.isin(part.start, always)
-        and precision[part].max() > OUTSTANDING**2
+        and precision[part].max() > LIMIT**2
     )
 
 
@@ -144,3 +150,64 @@ def wanted_for_evidence(problem: Problem) -> str:
     if problem.noise_known:
         return needed
     return f"The noise: a column sigma in the states file, the detector's gain, or repeats of the states. {needed}"
+
+
+@dataclass(frozen=True)
+class Names:
+    """Causes that the answer reports.
+
+    Attributes
+    ----------
+    named : likely ones; doubt : why some of them have no sure name.
+    untold : causes with as many values as the data have; they get no name.
+    """
+
+    named: tuple[Cause, ...]
+    doubt: Mapping[Cause, str]
+    untold: tuple[Cause, ...] = ()
+
+    @property
+    def sure(self) -> list[Cause]:
+        """Causes without a doubt."""
+        return [c for c in self.named if c.answer != "unknown" and c not in self.doubt]
+
+    @property
+    def rivals(self) -> list[tuple[Candidate, ...]]:
+        """Sets of effects of which one is present."""
+        return [(c.candidates[0], *c.other_effects) for c in self.named if c.other_effects]
+
+
+def with_parts(
+    posterior: Posterior, causes: Sequence[Cause], doubt: Mapping[Cause, str], *, chi2: float, noise_known: bool
+) -> dict[Cause, str]:
+    """Reasons of doubt by cause, with the causes that may be part of another mechanism.
+
+    `chi2` is that of structure.
+    """
+    reasons = dict(doubt)
+    for rank, cause in enumerate(causes, 1):
+        if noise_known:
+            weak = 2 * cause.log_odds * posterior.samples.best.unit < TIMES * rank**2 * chi2
+        else:
+            general = cause.candidates[0].effect.per_state or cause.candidates[0].is_pointwise
+            directions = posterior.sets.noise.directions if general else 0.0
+            weak = cause.log_odds < max(2 * NEEDED, TIMES * directions / 2)
+        # What the simple form of another cause leaves over is no cause of its own.
+        weak |= any(cause.log_odds < o.candidates[0].effect.rough * o.log_odds for o in causes)
+        if cause not in reasons and weak:
+            reasons[cause] = PART_OF_LEFT
+    # A sentence is a part of an unknown mechanism, whose other parts look like effects of the list.
+    if any(posterior.label(k).price for k in posterior.free_groups):
+        reasons |= {cause: PART_OF_UNLISTED for cause in causes if cause not in reasons and cause.answer != "unlisted"}
+    return reasons
+
+
+def answer_of(cause: Cause, doubt: str | None) -> tuple[Answer, float]:
+    """The word for a cause and its probability: one that may be part of another mechanism is at most likely, one
+    with another doubt is unknown."""
+    if doubt is None:
+        return cause.answer, cause.probability
+    probability = min(cause.probability, LIKELY)
+    if doubt not in PARTS or cause.probability < SURE:
+        return "unknown", probability
+    return "one of" if cause.alternatives else "unlisted" if cause.candidates[0].price else "likely", probability

@@ -186,16 +186,8 @@ class Problem(Protocol):
         """Rms noise over the mean signal, of one capture or of all, with the counts corrected by these values."""
         ...
 
-    def rows(self, k: int, space: Space, values: Array) -> Array:
-        """Measurement matrix W (L, 16) of a capture."""
-        ...
-
     def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
         """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
-        ...
-
-    def pool(self) -> tuple[Candidate, ...]:
-        """Every effect at every place."""
         ...
 
     def powers(self) -> list[tuple[int, Array]]:

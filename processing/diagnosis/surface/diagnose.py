@@ -10,11 +10,10 @@ import numpy as np
 from processing.arrays import Array
 from processing.computing.blas import one_blas_thread
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import causes, observable_effects
+from processing.diagnosis.search.causes import Names, causes, observable_effects, with_parts
 from processing.diagnosis.search.correction import solution
 from processing.diagnosis.search.decision import Judgement, beyond_chance, in_words
 from processing.diagnosis.search.fit import Fit, Solution
-from processing.diagnosis.search.names import Names, with_parts
 from processing.diagnosis.search.posterior import Posterior, Say, fit_posterior
 from processing.diagnosis.search.range_of import least_apart, rank_of
 from processing.diagnosis.search.result import CaptureReport, Correction, Diagnosis
@@ -32,8 +31,6 @@ from processing.storage.captures.capture import Capture, CaptureError
 #: [of the signal] Structure up to which a linear Stokes camera cannot tell an effect from small eigenvalues that are
 #: not equal: apart by what the paper saw (9 % at 451 nm, 3 % at 662 nm) they leave 0.1 to 2 % on the simulated sphere.
 AS_LIKELY = 0.015
-#: [1] Times that an error may grow at most as a bent valley asks.
-MOST_WIDER = 8.0
 CONFIRM = (
     " Confirm with a full Mueller capture: linear Stokes cannot test that the three other processes are equal, and so "
     "small a residual may come from that alone."
@@ -123,8 +120,8 @@ def widen_errors(problem: SurfaceProblem, posterior: Posterior, solved: Solution
 
     for j in np.flatnonzero(size > 0):
         step = SHOWN * np.sqrt(size[j]) * axes[:, j] * typical
-        while wide[j] < MOST_WIDER and (missing := SHOWN / np.sqrt(rise(wide[j] * step))) > GROWTH:
-            wide[j] = min(wide[j] * min(missing, 2.0), MOST_WIDER)
+        while (missing := SHOWN / np.sqrt(rise(wide[j] * step))) > GROWTH:
+            wide[j] *= min(missing, 2.0)
     covariance = posterior.covariance.copy()
     covariance[np.ix_(index, index)] = (axes * size * wide**2) @ axes.T * np.outer(typical, typical)
     wider = np.sqrt(np.diag(covariance) / np.maximum(np.diag(posterior.covariance), 1e-300))

@@ -9,10 +9,9 @@ from scipy.sparse.csgraph import connected_components
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import Cause, information, significance, wanted_for_evidence
+from processing.diagnosis.search.causes import Cause, Names, answer_of, information, significance, wanted_for_evidence
 from processing.diagnosis.search.decision import Judgement, held_out_check, refusal
 from processing.diagnosis.search.fit import HeldOut, Solution
-from processing.diagnosis.search.names import Names, answer_of
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import (
     BeyondNoise,
