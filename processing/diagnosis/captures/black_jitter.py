@@ -7,7 +7,7 @@ from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.captures.outliers import NORMAL_MAD
 from processing.diagnosis.search.range_of import inside_and_outside, range_of
-from processing.diagnosis.search.rules import FEWEST_PIXELS, MOSTLY, NOISE_SURE, OUTSTANDING, SMALL
+from processing.diagnosis.search.rules import FEWEST_PIXELS, LIMIT, MOSTLY, SMALL
 from processing.instrument.grammar import TIMES, course
 from processing.reduction.noise import QUANTIZATION
 
@@ -62,7 +62,7 @@ def _dim_levels(y: NDArray[np.float32], count: float) -> tuple[Array, float]:
     deviation = y - y.mean(axis=0, dtype=np.float64)
     middle = np.median(deviation, axis=1, keepdims=True)
     scatter = np.median(np.abs(deviation - middle), axis=1, keepdims=True) / NORMAL_MAD
-    reach = OUTSTANDING * np.maximum(scatter, count / 2)
+    reach = LIMIT * np.maximum(scatter, count / 2)
     clipped = np.clip(deviation, middle - reach, middle + reach)
     rounding = (count / np.pi) ** 2 / 2 * np.exp(-4 * np.pi**2 * spread)
     level = clipped.mean(axis=1) + y.mean(dtype=np.float64)
@@ -71,7 +71,7 @@ def _dim_levels(y: NDArray[np.float32], count: float) -> tuple[Array, float]:
 
 def _is_significant(levels: Array, noise: float, free: int) -> bool:
     """Whether levels in `free` directions are more than their noise."""
-    return bool(levels @ levels >= noise * (free + NOISE_SURE * np.sqrt(2 * free)))
+    return bool(levels @ levels >= noise * (free + LIMIT * np.sqrt(2 * free)))
 
 
 def _courses(data: CaptureData, outside: Array) -> Array:
@@ -91,4 +91,4 @@ def _halves_agree(y: NDArray[np.float32], mean: Array, outside: Array, count: fl
         return True
     (first, v1), (second, v2) = (_dim_levels(y[:, half], count) for half in (bright, ~bright))
     free, difference = outside.shape[1], outside.T @ (first - second)
-    return bool(difference @ difference < (v1 + v2) * (free + NOISE_SURE * np.sqrt(2 * free)))
+    return bool(difference @ difference < (v1 + v2) * (free + LIMIT * np.sqrt(2 * free)))

@@ -187,21 +187,17 @@ class CaptureData:
         w = self.matrix_of(model, changes)
         return w if self.sample is None else (w @ self.sample)[:, None]
 
-    def variance(self, rows: slice = slice(None)) -> Array:
-        """Variance (N, channels, rows, columns) in full scale squared; right on average over noisy signals.
+    def variance(self, where: slice | NDArray[np.bool_] = slice(None)) -> Array:
+        """Variance in full scale squared of rows (N, channels, rows, columns), or of pixels (N, channels, P).
 
-        Cutting it off at zero signal would make it too large in dark states, so a single one may be negative.
+        It is right on average over noisy signals. Cutting it off at zero signal would make it too large in dark states,
+        so a single one may be negative.
         """
         if self.true_variance is not None:
-            return np.asarray(self.true_variance[:, :, rows], dtype=float)
-        shape = (-1, 1, 1, 1)
-        return np.asarray(self.slope.reshape(shape) * self.signal[:, :, rows] + self.floor.reshape(shape))
-
-    def variance_of(self, pixels: NDArray[np.bool_]) -> Array:
-        """The same (N, channels, P) of the pixels (rows, columns) that are true."""
-        if self.true_variance is not None:
-            return np.asarray(self.true_variance[:, :, pixels], dtype=float)
-        return np.asarray(self.slope[:, None, None] * self.signal[:, :, pixels] + self.floor[:, None, None])
+            return np.asarray(self.true_variance[:, :, where], dtype=float)
+        signal = self.signal[:, :, where]
+        slope, floor = (of_state.reshape(-1, *(1,) * (signal.ndim - 1)) for of_state in (self.slope, self.floor))
+        return np.asarray(slope * signal + floor)
 
     def undone(self, correct: Correct) -> CaptureData:
         """The capture with corrected counts, and noise that is stretched with them."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.search.range_of import inside_and_outside
-from processing.diagnosis.search.rules import LITTLE, OUTSTANDING
+from processing.diagnosis.search.rules import LIMIT, LITTLE
 from processing.instrument.model import InstrumentModel
 from processing.reduction.black import Black
 from processing.storage.captures.capture import Capture
@@ -70,7 +70,7 @@ def without_noise_of_darks(
     basis = np.concatenate([np.ones_like(light[:1]), light])
     of_dark = np.asarray(residual - (residual @ np.linalg.pinv(basis)) @ basis, dtype=float)
     # A pixel with a hit, or a hot one, tells nothing of its dark frames.
-    of_dark[np.abs(of_dark) > OUTSTANDING] = 0.0
+    of_dark[np.abs(of_dark) > LIMIT] = 0.0
     subtracted = np.zeros((len(y), of_dark.shape[1]), dtype=np.float32)
     subtracted[counts] = sd[:, None] * (u @ ((spread - 1) * of_dark) + in_light @ (size / spread * of_dark))
     signal = data.signal.copy()

@@ -19,10 +19,9 @@ from processing.diagnosis.search.rules import (
     DARK_NOISE_OFF,
     FEWEST_FREE,
     FEWEST_OF_MANY,
-    LEAST_PART,
+    LIMIT,
     LITTLE,
     NOISE_OFF,
-    NOISE_SURE,
     SHOWN,
     SMALL,
     TILES,
@@ -31,8 +30,6 @@ from processing.storage.captures.capture import CaptureError
 
 #: [pixels] Distance over which noise is no longer alike, and the image has hardly changed; and one more.
 NOT_ALIKE_PX = 3
-#: [rows, or columns] Distance of those whose means are compared: next to each other they may share noise.
-LINES_APART = 2
 #: [1] Deviation of the variance of a pixel that is told where neighbours share noise: what a pixel shows of it is not
 #: known better.
 NOISE_OFF_MIXED = 0.15
@@ -163,14 +160,14 @@ def _common(r: Array, expected: Array, axis: int, *, alike: float, free: float) 
     mean, variance = np.nansum(r, axis=axis) / counts, np.nansum(expected, axis=axis) / counts
     variance[variance == 0] = np.nan
     of_mean = variance / counts * (1 + 2 * max(alike, 0.0))
-    (first, second), (v1, v2), (n1, n2) = (_pairs(x, LINES_APART, 1) for x in (mean, variance, of_mean))
+    (first, second), (v1, v2), (n1, n2) = (_pairs(x, NOT_ALIKE_PX, 1) for x in (mean, variance, of_mean))
     noise = n1 + n2
     weight = (v1 + v2) / noise**2
     total = np.nansum(weight * (v1 + v2))
     # Every line is in two differences.
     error = np.sqrt(3 / free * np.nansum((weight * noise) ** 2)) / total
     common = float(np.nansum(weight * ((first - second) ** 2 - noise)) / total)
-    return common if common > NOISE_SURE * error else 0.0
+    return common if common > LIMIT * error else 0.0
 
 
 def _levels(r: Array, light: Array, dark: Array, free: float) -> tuple[float, float, Array]:
@@ -181,7 +178,7 @@ def _levels(r: Array, light: Array, dark: Array, free: float) -> tuple[float, fl
     design = np.stack([np.mean(_pairs(x, NOT_ALIKE_PX, 2), axis=0)[used] for x in (light, dark)], axis=1)
     factors = np.ones(2)
     for _ in range(3):
-        weight = 1 / (design @ np.maximum(factors, LEAST_PART)) ** 2
+        weight = 1 / (design @ np.maximum(factors, LITTLE)) ** 2
         # Where the images do not tell both parts apart, both are as declared.
         normal = (design * weight[:, None]).T @ design + LITTLE * np.eye(2)
         factors = np.linalg.solve(normal, (design * weight[:, None]).T @ half[used] + LITTLE)
@@ -233,7 +230,7 @@ def _noise_note(text: str, variance: float, data: CaptureData) -> str:
 
 
 def _shared_by_neighbours(noise: DetectorNoise) -> SharedNoise:
-    least = max(SMALL, NOISE_SURE * noise.alike_error)
+    least = max(SMALL, LIMIT * noise.alike_error)
     # The correlation of neighbours is m (1 - m) / (1 - 2 m (1 - m)).
     parts = (mixed_part(min(c / (1 + 2 * c), 0.25)) if c > least else 0.0 for c in (noise.right, noise.down))
     return SharedNoise(*parts)
@@ -245,7 +242,7 @@ def _wide(shared: SharedNoise, data: CaptureData) -> Array:
     lines = np.full(len(data.slope), 1 + shared.rows * width + shared.columns * height)
     if data.rounding is None:
         return lines
-    variance = data.variance_of(data.usable).mean(axis=(1, 2))
+    variance = data.variance(data.usable).mean(axis=(1, 2))
     rounding = data.usable.sum() * data.rounding / np.maximum(variance, data.floor)
     return lines + np.where(rounding > LITTLE, rounding, 0.0)
 
@@ -255,7 +252,7 @@ def _lines(shared: SharedNoise, data: CaptureData) -> tuple[float, float]:
     if not (shared.rows or shared.columns):
         return 0.0, 0.0
     # They are told relative to the noise of each state, of which the dark ones show most.
-    variance = data.variance_of(data.usable).mean(axis=2)
+    variance = data.variance(data.usable).mean(axis=2)
     usual = 1 / float(np.mean(1 / np.maximum(variance, 1e-300)))
     return shared.rows * usual, shared.columns * usual
 
@@ -267,13 +264,13 @@ def noise_factors(noise: DetectorNoise, shown: float, estimated: bool) -> tuple[
     inverse = np.asarray(np.linalg.inv(noise.covariance / shown**2), dtype=float)
     usual = 1.0, 1.0
     if estimated:
-        if _distance(factors, usual, inverse) < NOISE_SURE**2:
+        if _distance(factors, usual, inverse) < LIMIT**2:
             return usual
         return _balance(noise, white, max(float(factors[1]), SMALL))
     bent = noise.bent
     least = NOISE_OFF if shown == 1 else NOISE_OFF_MIXED
     far = not min(bent, 1.0) - least < white < max(bent, 1.0) + least
-    if _distance(factors, usual, inverse) < NOISE_SURE**2 or not (far or _dark_is_off(noise, shown)):
+    if _distance(factors, usual, inverse) < LIMIT**2 or not (far or _dark_is_off(noise, shown)):
         return usual
     # As simple as the images allow: another gain, another read noise, both.
     gains, reads = ((s, s**2) for s in FACTORS), ((1.0, s) for s in FACTORS)
@@ -289,9 +286,7 @@ def _distance(factors: Array, expected: tuple[float, float], inverse: Array) -> 
 
 
 def _dark_is_off(noise: DetectorNoise, shown: float) -> bool:
-    return abs(noise.dark / shown - 1) > max(
-        DARK_NOISE_OFF, NOISE_SURE * float(np.sqrt(noise.covariance[1, 1])) / shown
-    )
+    return abs(noise.dark / shown - 1) > max(DARK_NOISE_OFF, LIMIT * float(np.sqrt(noise.covariance[1, 1])) / shown)
 
 
 def _balance(noise: DetectorNoise, white: float, dark: float) -> tuple[float, float]:

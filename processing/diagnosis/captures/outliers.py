@@ -25,10 +25,10 @@ from processing.diagnosis.search.rules import (
     FEWEST_FREE,
     FEWEST_OF_MANY,
     GROWTH,
+    LIMIT,
     LITTLE,
     MOST_SPOILT,
     MOSTLY,
-    OUTSTANDING,
     SMALL,
 )
 
@@ -76,7 +76,7 @@ class Whitened:
         """Pixels `good` (rows, columns) against rows a (L, K) of the model."""
         rows, keep = data.values_per_pixel, data.row_counts
         y = data.signal.reshape(rows, -1)[np.ix_(keep, good.reshape(-1))]
-        variance = data.variance_of(good).reshape(rows, -1)[keep].astype(np.float32)
+        variance = data.variance(good).reshape(rows, -1)[keep].astype(np.float32)
         mean = np.mean(variance, axis=1, dtype=float)
         # That of a row without any is zero.
         level = np.sqrt(np.maximum(mean, LITTLE * mean.max()))
@@ -89,7 +89,7 @@ class Whitened:
         outside = self.outside.astype(np.float32)
         r = outside @ (outside.T @ (self.y if clean.all() else self.y[:, clean]))
         scale = robust_scale(r).astype(np.float32)
-        inner = (outside.T @ np.clip(r, -OUTSTANDING * scale, OUTSTANDING * scale, out=r)).astype(float)
+        inner = (outside.T @ np.clip(r, -LIMIT * scale, LIMIT * scale, out=r)).astype(float)
         value, vector = np.linalg.eigh(inner @ inner.T / inner.shape[1])
         # Largest eigenvalue of noise over the median one (Marchenko and Pastur); beyond it all pixels share structure.
         edge = GROWTH * (1 + np.sqrt(len(value) / inner.shape[1])) ** 2
@@ -127,7 +127,7 @@ def bad_frames(data: CaptureData, a: Array) -> tuple[BadFrame, ...]:
     if not good.any():
         return ()
     y = data.signal[:, :, good].reshape(data.values_per_pixel, -1).astype(np.float64)
-    noise = data.variance_of(good).mean(axis=2).reshape(-1)
+    noise = data.variance(good).mean(axis=2).reshape(-1)
     bright = float(np.mean(y**2))
     moments = _Moments(y @ y.T / y.shape[1] / bright, noise * data.noise_known / bright, a, channels)
     state_indices = [k for k in range(states) if data.row_counts[k * channels]]
@@ -207,25 +207,15 @@ class _Moments:
         return (BadFrame(i, misfit, j), BadFrame(j, misfit, i)) if misfit >= LEAST_MISFIT else ()
 
 
-@dataclass(frozen=True)
-class Outliers:
-    """Excluded data: `hits` (N, channels, rows, columns) single intensities, `bad` (rows, columns) pixels."""
-
-    hits: NDArray[np.bool_]
-    bad: NDArray[np.bool_]
-
-
-def outliers_of(data: CaptureData, a: Array) -> Outliers:
-    """Hits and bad pixels of a capture against rows a (L, K) of its model."""
-    rows = data.values_per_pixel
+def outliers_of(data: CaptureData, a: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Hits (N, channels, rows, columns) and bad pixels (rows, columns) against rows a (L, K) of the model."""
     good, keep = data.usable & ~data.clipped, data.row_counts
-    hits, bad = np.zeros((rows, good.size), dtype=bool), np.zeros(good.shape, dtype=bool)
-    outliers = Outliers(hits.reshape(data.signal.shape), bad)
+    hits, bad = np.zeros(data.signal.shape, dtype=bool), np.zeros(good.shape, dtype=bool)
     if good.sum() < FEWEST_OF_MANY:
-        return outliers
+        return hits, bad
     white = Whitened.of(data, a, good)
     if white.outside.shape[1] < FEWEST_FREE:
-        return outliers
+        return hits, bad
     # What is struck tells a noise of its own: no state is believed to be far brighter than the usual one of its pixel.
     usual = np.maximum(np.median(white.variance, axis=0), np.float32(SMALL))
     share = np.sqrt(np.clip(white.variance / usual, np.float32(SMALL), np.float32(BAD_PIXEL)))
@@ -245,11 +235,10 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
         clean = (np.max(np.abs(t), axis=0) < HIT) & ~struck.any(axis=0)
         if clean.all() or clean.sum() < FEWEST_OF_MANY:
             break
-    hits[np.ix_(keep, good.reshape(-1))] = struck
+    hits.reshape(len(keep), -1)[np.ix_(keep, good.reshape(-1))] = struck
     map_of = np.full(good.shape, float(np.median(noisy)))
     map_of[good] = noisy
-    bad[...] = good & _noisier_than_around(map_of, white.outside.shape[1])
-    return outliers
+    return hits, good & _noisier_than_around(map_of, white.outside.shape[1])
 
 
 def _hits(
@@ -290,12 +279,11 @@ def _noisier_than_around(noisy: Array, free: int) -> NDArray[np.bool_]:
     return np.asarray(noisy > least * np.maximum(around, np.median(noisy)))
 
 
-def remove_outliers(data: CaptureData, outliers: Outliers) -> CaptureData:
-    """The capture with the pixels of outliers left out, and their counts filled in from the pixels around.
+def remove_outliers(data: CaptureData, every: NDArray[np.bool_]) -> CaptureData:
+    """The capture without the pixels of outliers (N, channels, rows, columns), filled in from the pixels around.
 
     A pixel is left out whole, since the moments need all its states; what is filled in serves image derivatives.
     """
-    every = outliers.hits | outliers.bad
     signal = data.signal.copy()
     box = np.ones((3, 3), dtype=np.float32)
     for n, c in np.argwhere(every.any(axis=(2, 3))):

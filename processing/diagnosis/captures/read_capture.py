@@ -17,7 +17,7 @@ from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.captures.dark_noise import without_noise_of_darks
 from processing.diagnosis.captures.rounding import Planes, Rounding
 from processing.diagnosis.captures.unstated_noise import estimated_noise
-from processing.diagnosis.search.rules import FEWEST_PIXELS, LIMIT, LITTLE, MOST_SPOILT, NOISE_SURE, OUTSTANDING
+from processing.diagnosis.search.rules import FEWEST_PIXELS, LIMIT, LITTLE, MOST_SPOILT
 from processing.instrument.changes import Conditions, elapsed, elapsed_error
 from processing.instrument.model import InstrumentModel
 from processing.reduction.capture_evidence import evidence_of
@@ -134,14 +134,14 @@ def _cuts_off(capture: Capture) -> bool:
     detector = capture.header.detector
     if not capture.integer_counts or detector.gain_e_per_count is None:
         return False
-    return detector.black_level_counts > NOISE_SURE * (detector.read_noise_e or 0.0) / detector.gain_e_per_count
+    return detector.black_level_counts > LIMIT * (detector.read_noise_e or 0.0) / detector.gain_e_per_count
 
 
 def _clip_level(capture: Capture, correction: CountCorrection) -> float | None:
     detector, level = capture.header.detector, correction.saturation
     if detector.full_well_e is not None and detector.gain_e_per_count is not None:
         well = detector.black_level_counts + detector.full_well_e / detector.gain_e_per_count
-        spread = OUTSTANDING * (detector.read_noise_e or 0.0) / detector.gain_e_per_count
+        spread = LIMIT * (detector.read_noise_e or 0.0) / detector.gain_e_per_count
         level = well - spread if level is None else min(level, well - spread)
     return level
 

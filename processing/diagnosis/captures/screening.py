@@ -77,10 +77,10 @@ def screen_capture(data: CaptureData, model: InstrumentModel, say: Callable[[str
     `model` is resolved at its wavelength.
     """
     a = data.rows_of(model, changes_of(model, data.conditions, data.name))
-    outliers = outliers_of(data, a)
-    hits, bad = np.argwhere(outliers.hits), np.argwhere(outliers.bad)
+    is_hit, is_bad = outliers_of(data, a)
+    hits, bad = np.argwhere(is_hit), np.argwhere(is_bad)
     if len(hits) or len(bad):
-        data = remove_outliers(data, outliers)
+        data = remove_outliers(data, is_hit | is_bad)
         # What was struck is no noise either.
         data = estimated_noise(data) if data.noise_estimated else data
         data = replace(data, left_out=LeftOut(hits=hits, pixels=bad, pitch=data.pitch))

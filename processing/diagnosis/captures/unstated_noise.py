@@ -7,10 +7,9 @@ from scipy.optimize import nnls
 
 from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData
-from processing.diagnosis.search.rules import ENOUGH_PX, FEWEST_FREE, LEAST_PART, SMALL
+from processing.diagnosis.search.range_of import NEARLY_ZERO
+from processing.diagnosis.search.rules import ENOUGH_PX, FEWEST_FREE, LITTLE, SMALL
 
-#: [digits] Of the range of the signal, to which two signals are the same.
-DIGITS = 9
 #: [levels] Of the signal at which their scatter is told.
 LEVELS = 24
 
@@ -63,7 +62,7 @@ def _line_of_scatter(y: Array, of_row: Array, of_pixel: Array, keep: int) -> tup
     square = residual[good] ** 2 / share[good] / np.maximum(1 - along.sum(axis=0), SMALL)
     signal = ((of_noise / share) @ np.maximum(y - residual, 0))[good]
     # Signals that rounding alone sets apart share a level, or it would hang on the processor's order of sums.
-    alike = np.round(signal / max(float(np.ptp(signal)), 1e-300), DIGITS)
+    alike = np.round(signal / max(NEARLY_ZERO * float(np.ptp(signal)), 1e-300))
     edges = np.quantile(alike, np.linspace(0, 1, LEVELS + 1))
     level = np.clip(np.searchsorted(edges, alike, side="right") - 1, 0, LEVELS - 1)
     count = np.bincount(level.reshape(-1), minlength=LEVELS)
@@ -74,7 +73,7 @@ def _line_of_scatter(y: Array, of_row: Array, of_pixel: Array, keep: int) -> tup
         np.stack([np.maximum(mean, 0), np.ones(LEVELS)], axis=1) * weight[:, None], variance * weight
     )
     # Counts of zero have a noise all the same: where the line leads to none, they would weigh as much as they like.
-    floor = max(floor, LEAST_PART * float(np.mean(square)), 1e-12)
+    floor = max(floor, LITTLE * float(np.mean(square)), 1e-12)
     # Weighted as it will be used, the scatter must come out as one.
     correction = float(np.mean(square / (slope * np.maximum(signal, 0) + floor)))
     return slope * correction, floor * correction

@@ -15,7 +15,7 @@ from processing.diagnosis.captures.capture_data import CaptureData, Correct
 from processing.diagnosis.captures.noise import DetectorNoise, detector_noise, noise_factors
 from processing.diagnosis.instrument.features import MARGIN
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.rules import DARK_NOISE_OFF, GAIN_OFF, LEAST_PART, NOISE_OFF, SHOWN
+from processing.diagnosis.search.rules import DARK_NOISE_OFF, LITTLE, NOISE_OFF, SHOWN
 from processing.diagnosis.search.space import Space
 
 
@@ -76,7 +76,7 @@ def with_noise_of_light(data: CaptureData, a: Array, bends: Mapping[Candidate, A
     shared = data.shared.shown < 1 or data.shared.rows > 0 or data.shared.columns > 0
     if not data.noise_known or data.noise_estimated or shared:
         return _use_light_noise(data, bends)
-    least, usual = max(abs(data.noise_level[0] - 1), GAIN_OFF), (1.0, 1.0)
+    least, usual = max(abs(data.noise_level[0] - 1), NOISE_OFF / 2), (1.0, 1.0)
     # An offset looks like another read-out noise, and the reverse.
     data = _scale_noise(data, usual if bends else data.noise_factors, usual)
     noise = _detector_noise(data, a, bends)
@@ -96,10 +96,10 @@ def _level(noise: DetectorNoise) -> tuple[float, float]:
 
     A constant offset that nothing else shows changes the noise without light alone.
     """
-    common, dark = (GAIN_OFF / 2) ** 2, np.diag([0.0, DARK_NOISE_OFF**2])
+    common, dark = (NOISE_OFF / 4) ** 2, np.diag([0.0, DARK_NOISE_OFF**2])
     prior = common + dark
     deviation = prior @ np.linalg.solve(prior + noise.covariance, np.array([noise.shot, noise.dark]) - 1)
-    return float(np.clip(1 + deviation[0], 1 - NOISE_OFF, 1 + NOISE_OFF)), float(max(1 + deviation[1], LEAST_PART))
+    return float(np.clip(1 + deviation[0], 1 - NOISE_OFF, 1 + NOISE_OFF)), float(max(1 + deviation[1], LITTLE))
 
 
 def _scale_noise(data: CaptureData, factors: tuple[float, float], level: tuple[float, float]) -> CaptureData:

@@ -40,9 +40,6 @@ from processing.instrument.applied_effects import changes_of
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
 
-#: [intensities for each unknown] That a pixel has to have without its clipped states: fewer leave next to nothing over.
-ENOUGH_SOUND = 1.5
-
 #: [points] Of expansion that are kept besides the first: each has counts of its own.
 MOST_POINTS = 3
 
@@ -262,14 +259,6 @@ class InstrumentProblem:
         moments = self.near(space, values)[0].moments
         return float(np.sqrt(np.mean([m.noise_floor**2 for m in (moments if k is None else moments[k : k + 1])])))
 
-    def rows(self, k: int, space: Space, values: Array) -> Array:
-        """Measurement matrix W (L, 16) of a capture, for exposures of one."""
-        return self.rows_of(k, self.changes(k, space, values))
-
-    def rows_of(self, k: int, changes: Changes) -> Array:
-        """The same of the changes of a capture."""
-        return self.models[k].rows(self.captures[k].conditions.angles_deg, changes).reshape(-1, 16)
-
     def columns(self, capture: int, changes: Changes) -> Array:
         """A (L, K), rows in units of their noise."""
         a = self._columns_of_one_source(capture, changes)
@@ -395,7 +384,7 @@ class InstrumentProblem:
         for block in self.moments[k].blocks:
             if block.clipped and changes.drop_clipped:
                 # What is left of a clipped pixel is its states without any clipping, if they are enough.
-                if block.sound.size < ENOUGH_SOUND * a.shape[1]:
+                if block.sound.size <= a.shape[1]:
                     continue
                 block = replace(block, rows=block.sound)
             if block.rows.size:

@@ -59,25 +59,17 @@ MOST_SPOILT = 0.01
 FEWEST_FREE = 4
 
 # ---- the detector's noise, as its images show it ------------------------------------------------------------------
-#: [standard deviations] From which on the noise, or an effect over the image, differs from what is declared; and below
-#: black, from which on counts of zero are cut off.
-NOISE_SURE = 6.0
-#: [1] Deviation of the variance of a pixel from what is declared that is told: photon transfer curves of a lab are as
-#: good.
+#: [1] Deviation of the variance of a pixel from what is declared that is told: four standard deviations of what labs
+#: know of a gain by photon transfer curves. A bend of the response that needs half of it does not go with the counts.
 NOISE_OFF = 0.06
 #: [1] The same of the part of the variance without light: darks of a lab are as good.
 DARK_NOISE_OFF = 0.5
 #: [of the whole] Below which a part tells nothing: of the variance with or without light, of the scatter of a row, of
 #: the light in dim pixels, of the noise in image derivatives, of the noise that neighbours share.
 SMALL = 0.05
-#: [of the whole] A part that changes nothing: weak beliefs, first damping, least width of a prior and of a noise,
-#: and how much worse another branch of the train may fit.
+#: [of the whole] A part that changes nothing: weak beliefs, first damping, least width of a prior, least part of a
+#: variance, and how much worse another branch of the train may fit.
 LITTLE = 1e-3
-#: [of what is usual] Least part of the variance that weights are made of.
-LEAST_PART = 0.01
-#: [1] Deviation of the variance from what is declared where a bend of the response is undone, beyond which that bend
-#: does not go with how the counts scatter: two standard deviations of what labs know of a gain.
-GAIN_OFF = 0.03
 
 # ---- search --------------------------------------------------------------------------------------------------------
 #: [of the signal] Residual above which nominal values are searched for from many starts.
@@ -110,7 +102,8 @@ CHANCE_WORSE = 0.5
 LEAST_CHANGE = 2e-5
 
 # ---- structure -----------------------------------------------------------------------------------------------------
-#: [standard deviations] Beyond which a test of the residual says "structure", and a pixel is not dark.
+#: [standard deviations] From which on something stands out: structure of a residual, the noise from what is declared,
+#: a pixel from the dark, an effect of typical size, a mistake of wiring. Residuals are cut back there.
 LIMIT = 5.0
 #: [pixels] Below which means over them tell no noise, no black level and no pattern.
 FEWEST_PIXELS = 30
@@ -146,9 +139,6 @@ TESTABLE = 0.75
 TIMES = 100.0
 
 # ---- what captures can show ----------------------------------------------------------------------------------------
-#: [standard deviations] By which something stands out that is tested once: an effect of typical size, a mistake of
-#: wiring, an autocorrelation over the states; and at which residuals and counts near the full well are cut back.
-OUTSTANDING = 4.0
 #: [sine] Of the angle between two signatures, from which on a capture tells them apart.
 APART = 0.3
 

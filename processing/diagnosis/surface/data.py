@@ -11,7 +11,7 @@ from scipy import ndimage
 from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.captures.read_capture import read_capture
-from processing.diagnosis.search.rules import FEWEST_OF_MANY, FOLDS_OF_TILES, TILES
+from processing.diagnosis.search.rules import FEWEST_OF_MANY, FOLDS_OF_TILES, SMALL, TILES
 from processing.diagnosis.surface.view import SurfaceView
 from processing.errors import ProcessError
 from processing.geometry.pinhole import PinholeCamera
@@ -24,12 +24,8 @@ from processing.reduction.sample_states import sample_states
 from processing.reflectance.base import ReflectanceModel
 from processing.storage.captures.capture import Capture
 
-#: [of the median] Brightness below which a pixel of an object is shadow or background.
-DARK = 0.1
 #: [pixels] Of an object that are used at most, evenly spread.
 MOST_OF_OBJECT = 4000
-#: [of its radius] Rim of an object that is left out: one off its place would mix object and background there.
-RIM_OF_OBJECT = 0.06
 #: [pixels of the camera] The same, at least: the interpolation of a mosaic mixes as many.
 RIM_PX = 6
 
@@ -178,8 +174,8 @@ def _pick(
     if not mask.any():
         raise ProcessError(f"{data.name}: no pixel sees a lit point of the object at Omega {omega:g} degrees.")
     mean = signal.mean(axis=(0, 1), dtype=np.float64)
-    lit = mean > DARK * np.median(mean[mask])
-    rim = int(np.ceil(max(RIM_OF_OBJECT * np.sqrt(mask.sum() / np.pi), RIM_PX / (cell * data.binned))))
+    lit = mean > SMALL * np.median(mean[mask])
+    rim = int(np.ceil(max(SMALL * np.sqrt(mask.sum() / np.pi), RIM_PX / (cell * data.binned))))
     inside = ndimage.binary_erosion(mask & lit, iterations=rim)
     good = inside & data.usable & ~ndimage.binary_dilation(data.clipped, iterations=1)
     # Neighbours of an interpolated mosaic share pixels; every second one does not.
