@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,10 @@ SAMPLES: dict[str, NDArray[np.float64]] = {
 }
 
 
+#: Matrix W (L, 16) of a capture in which a candidate acts, and its changes (parameters, L, 16) for typical sizes.
+Slopes = Callable[[Candidate], tuple[Array, Array]]
+
+
 def recommended(
     problem: InstrumentProblem,
     space: Space,
@@ -37,19 +42,20 @@ def recommended(
 ) -> str:
     """Next capture: one that separates each indistinguishable set, else one that shows the unseen effects."""
     unseen = [c for c in unseen if not (c.acts_on_counts or c.effect.varies_over_image)]
-    return " ".join(dict.fromkeys(_capture(problem, space, fit, rivals, unseen=unseen) for rivals in sets or ((),)))
+    slopes = cache(partial(_slopes, problem, space, fit))
+    return " ".join(dict.fromkeys(_capture(problem, slopes, rivals, unseen=unseen) for rivals in sets or ((),)))
 
 
 def _capture(
-    problem: InstrumentProblem, space: Space, fit: Fit, rivals: Sequence[Candidate], *, unseen: Sequence[Candidate]
+    problem: InstrumentProblem, slopes: Slopes, rivals: Sequence[Candidate], *, unseen: Sequence[Candidate]
 ) -> str:
     """One sentence: the capture that separates the rivals, or shows the unseen, or that none of the usual does."""
     rows_side = [c for c in rivals if not c.acts_on_counts]
-    best, power = _best_sample(problem, space, fit, rows_side, unseen=unseen)
+    best, power = _best_sample(problem, slopes, rows_side, unseen=unseen)
     listed = [c for c in rows_side if not c.price]
     if power < APART and 1 < len(listed) < len(rows_side):
         # A sentence can be an exact double of an effect; what separates the effects still helps.
-        best, power = _best_sample(problem, space, fit, listed, unseen=unseen)
+        best, power = _best_sample(problem, slopes, listed, unseen=unseen)
     if any(c.acts_on_counts for c in rivals):
         return (
             "A series of exposure times on an unpolarized, evenly lit target tells detector effects from optics; "
@@ -67,7 +73,7 @@ def _capture(
 
 
 def _best_sample(
-    problem: InstrumentProblem, space: Space, fit: Fit, rivals: Sequence[Candidate], *, unseen: Sequence[Candidate]
+    problem: InstrumentProblem, slopes: Slopes, rivals: Sequence[Candidate], *, unseen: Sequence[Candidate]
 ) -> tuple[str, float]:
     """The sample not captured yet that tells the most, and how much."""
     have = [c.sample for c in problem.captures]
@@ -75,43 +81,38 @@ def _best_sample(
     for name, sample in SAMPLES.items():
         if any(h is not None and np.allclose(h / np.abs(h).max(), sample.reshape(16) / sample.max()) for h in have):
             continue
-        value = _power(problem, space, fit, sample, rivals=rivals, unseen=unseen)
+        value = _power(slopes, sample.reshape(16), rivals=rivals, unseen=unseen)
         # A simpler sample is preferred unless another one tells clearly more.
         if value > power + APART / 2:
             best, power = name, value
     return best, power
 
 
-def _power(
-    problem: InstrumentProblem,
-    space: Space,
-    fit: Fit,
-    sample: Array,
-    *,
-    rivals: Sequence[Candidate],
-    unseen: Sequence[Candidate],
-) -> float:
-    signatures = [_signature(problem, space, fit, sample.reshape(16), candidate=c) for c in rivals or unseen]
+def _power(slopes: Slopes, sample: Array, *, rivals: Sequence[Candidate], unseen: Sequence[Candidate]) -> float:
+    signatures = [_signature(*slopes(c), sample) for c in rivals or unseen]
     is_visible = [bool(np.linalg.norm(each) >= LEAST_NOISE) for each in signatures]
     if not rivals:
         return float(np.mean(is_visible)) if is_visible else 0.0
     return least_apart(signatures) if all(is_visible) or len(rivals) == 1 else 0.0
 
 
-def _signature(problem: InstrumentProblem, space: Space, fit: Fit, sample: Array, *, candidate: Candidate) -> Array:
-    """Change (L, parameters) of the relative signal for typical sizes, the throughput projected out."""
+def _signature(w: Array, dw: Array, sample: Array) -> Array:
+    """Change (L, parameters) of the relative signal of a sample, the throughput projected out."""
+    signal, changes = w @ sample, (dw @ sample).T
+    square = signal @ signal
+    if square == 0:
+        return np.zeros_like(changes)
+    return np.asarray((changes - np.outer(signal, signal @ changes) / square) / np.sqrt(square))
+
+
+def _slopes(problem: InstrumentProblem, space: Space, fit: Fit, candidate: Candidate) -> tuple[Array, Array]:
     capture = next(k for k, w in enumerate(problem.wavelengths_nm) if candidate.acts(k, w))
     joint = Space((*space.candidates, candidate)) if candidate not in space.candidates else space
-    zero = np.concatenate([fit.values, np.zeros(joint.size - space.size)])
+    values = np.concatenate([fit.values, np.zeros(joint.size - space.size)])
     part = joint.slices[joint.candidates.index(candidate)]
 
-    def signal(values: Array) -> Array:
-        w = problem.captures[capture].matrix_of(problem.models[capture], problem.changes(capture, joint, values))
-        return np.asarray(w @ sample)
+    def matrix(at: Array) -> Array:
+        return problem.captures[capture].matrix_of(problem.models[capture], problem.changes(capture, joint, at))
 
-    start = signal(zero)
-    scale = np.linalg.norm(start)
-    if scale == 0:
-        return np.zeros((start.size, candidate.size))
-    slopes = np.stack([signal(moved) - start for moved, _ in step_values(candidate, part, zero)], axis=1) / STEP
-    return np.asarray(slopes - np.outer(start, start @ slopes) / scale**2) / scale
+    w = matrix(values)
+    return w, np.array([matrix(moved) - w for moved, _ in step_values(candidate, part, values)]) / STEP

@@ -52,12 +52,13 @@ def minimize(
     expansions: int = ROUNDS,
     least_gain: float = LEAST_GAIN,
     weak: Array | None = None,
+    at_start: Sums | None = None,
 ) -> Fit:
     """Least chi-square over its stretch by Levenberg-Marquardt with bounds, on the data of the folds given.
 
     It ends when a step gains less than `least_gain`. `weak` (K,) is the curvature of the prior; default: `prior`. Some
     values may be held, others are `free` (K,). Corrections of counts are expanded about the start, and at most
-    `expansions` times anew about where the fit ended.
+    `expansions` times anew about where the fit ended. `at_start`: the sums at the start, if they are known.
     """
     weak = prior(space) if weak is None else weak
     use = list(range(problem.folds) if folds is None else folds)
@@ -66,8 +67,10 @@ def minimize(
     for _ in range(1 + (expansions if folds is None else 0)):
         if folds is None and not problem.relinearize(space, start) and fit is not None:
             break
-        fit = _descend(problem, space, start, use, free=move, steps=steps, least_gain=least_gain, weak=weak)
-        start = fit.values
+        fit = _descend(
+            problem, space, start, use, free=move, steps=steps, least_gain=least_gain, weak=weak, sums=at_start
+        )
+        start, at_start = fit.values, None
     assert fit is not None
     return fit
 
@@ -82,10 +85,11 @@ def _descend(
     steps: int,
     least_gain: float,
     weak: Array,
+    sums: Sums | None,
 ) -> Fit:
     lower, upper = space.joined("lower"), space.joined("upper")
-    x = np.clip(x, lower, upper)
-    sums, damping = problem.sums(space, x), 0.0
+    x, damping = np.clip(x, lower, upper), 0.0
+    sums = problem.sums(space, x) if sums is None else sums
     reference = float(sums.freedom[use].sum())
     cost = _penalize(sums, weak, x, use, reference=reference)
     for _ in range(steps):
@@ -193,7 +197,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
     spent = np.zeros(space.size)
     for fold in range(problem.folds):
         training_folds = [f for f in range(problem.folds) if f != fold]
-        values = minimize(problem, space, full.values, training_folds, weak=weak).values
+        values = minimize(problem, space, full.values, training_folds, weak=weak, at_start=full.sums).values
         if local.any():
             start = np.where(local, full.values, values)
             fit = minimize(problem, space, start, [fold], free=local, steps=3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from processing.diagnosis.search.rules import ALTERNATIVE, NEEDED
-from processing.diagnosis.search.sets import NEVER, Sets, State
+from processing.diagnosis.search.sets import NEVER, Conditional, Sets, State
 
 #: [changes] That are tried one after the other without a gain before a climb ends, and instead of one group; one in so
 #: many of the groups without evidence is removed at once.
@@ -23,8 +23,8 @@ def climb(sets: Sets, state: State, without: int | None = None) -> State:
     state = sets.settled(state.copy())
     away = np.arange(len(sets.groups)) == without
     best, barred = sets.score(state), away.copy()
+    c = sets.conditional(state, follow=True)
     while True:
-        c = sets.conditional(state, follow=True)
         is_included = state.tau > 0
         gain = np.where(sets.free & ~barred, np.where(is_included, -c.log_odds, c.log_odds), -np.inf)
         k = int(np.argmax(gain))
@@ -36,7 +36,7 @@ def climb(sets: Sets, state: State, without: int | None = None) -> State:
         if now > best:
             state, best = tried, now
             barred = away.copy()
-            retune(sets, state)
+            c = retune(sets, state, follow=True)
         else:
             barred[k] = True
     return sets.settled(state)
@@ -51,8 +51,8 @@ def thin_out(sets: Sets) -> State:
     """Start from all groups and remove the least needed until all are needed; return the likeliest set."""
     state = sets.settled(everything(sets))
     best, best_state = -np.inf, state.copy()
+    c = sets.conditional(state)
     while True:
-        c = sets.conditional(state)
         if c.score > best:
             best, best_state = c.score, state.copy()
         odds = np.where((state.tau > 0) & sets.free, c.log_odds, np.inf)
@@ -62,12 +62,17 @@ def thin_out(sets: Sets) -> State:
         at_once = 1 if odds.min() < NEVER / 2 else max(1, int(np.sum(odds < 0)) // PATIENCE)
         worst = np.argsort(odds)[:at_once]
         state.tau[worst] = 0.0
-        retune(sets, state)
-        sets.settled(state)
+        c, unit = retune(sets, state), state.unit
+        if sets.settled(state).unit != unit:
+            c = sets.conditional(state)
 
 
-def retune(sets: Sets, state: State) -> None:
-    """Every group at its likeliest variance."""
-    c = sets.conditional(state)
+def retune(sets: Sets, state: State, *, follow: bool = False) -> Conditional:
+    """Put every group at its likeliest variance; return the conditional posterior there."""
+    c = sets.conditional(state, follow=follow)
     is_included = (state.tau > 0) & sets.free
-    state.tau[is_included] = sets.taus[np.argmax(c.tau_weights[is_included], axis=1)]
+    tau = sets.taus[np.argmax(c.tau_weights[is_included], axis=1)]
+    if np.array_equal(tau, state.tau[is_included]):
+        return c
+    state.tau[is_included] = tau
+    return sets.conditional(state, follow=follow)
