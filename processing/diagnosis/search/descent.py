@@ -83,8 +83,11 @@ def descend(
     return values
 
 
-def minimum_of(problem: Problem, space: Space, sets: Sets, state: State) -> Array:
-    """Values (K,) at the minimum of chi-square and prior of one set, from where it is if the problem is linear."""
+def minimum_of(problem: Problem, space: Space, sets: Sets, state: State) -> tuple[Array, float]:
+    """Values (K,) at the minimum of chi-square and prior of one set, and the minimum.
+
+    The descent begins where the minimum is if the problem is linear.
+    """
     fit, on = sets.fitted(state), state.tau > 0
     part, positions = _part_of(space, [g for g, is_on in zip(sets.groups, on, strict=True) if is_on])
     linear, tau = np.zeros(space.size), np.zeros(space.size)
@@ -95,8 +98,9 @@ def minimum_of(problem: Problem, space: Space, sets: Sets, state: State) -> Arra
     values = np.zeros(space.size)
     weak = state.unit / (tau * typical)[positions] ** 2
     start = (linear * typical)[positions]
-    values[positions] = minimize(problem, part, start, expansions=0, weak=weak).values
-    return values
+    minimum = minimize(problem, part, start, expansions=0, weak=weak)
+    values[positions] = minimum.values
+    return values, minimum.sums.chi2(problem.noise_known) + float(weak @ minimum.values**2)
 
 
 def _part_of(space: Space, groups: Sequence[Group]) -> tuple[Space, NDArray[np.int64]]:

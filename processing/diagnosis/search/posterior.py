@@ -180,12 +180,15 @@ def _of_bends(
     Corrections of counts are expanded about the current values, where the right one may look worse than a wrong one.
     Also returns the alternatives that fit equally well about their own values.
     """
-    rounds = [first]
+    rounds, log_likelihood = [first], first.sets.noise.log_likelihood
+    least_likely = log_likelihood(first.sets.fitted(first.state).excess) - 2 * NEEDED
     for k in (g for g in bends if first.state.tau[g] > 0):
         for j in (g for g in bends if first.state.tau[g] == 0):
             state = first.sets.without(first.state, k)
             state.tau[j] = first.state.tau[k]
-            trial = look(minimum_of(problem, space, first.sets, first.sets.settled(state)))
+            values, excess = minimum_of(problem, space, first.sets, first.sets.settled(state))
+            # What fits far worse about its own values is no alternative, whatever other groups may add.
+            trial = look(values) if log_likelihood(excess) > least_likely else None
             rounds += [trial] if trial is not None else []
     best = max(rounds, key=lambda trial: trial.score)
     problem.relinearize(space, best.about)
@@ -202,10 +205,11 @@ def _of_bends(
 def _settle(problem: Problem, space: Space, first: _Round, look: Look) -> _Round:
     """Linearize again about the new values until they converge.
 
-    Poorly determined values can drift together, out of the range of the linearization. So the iteration stops when the
-    evidence falls below that of an earlier, verified round.
+    The iteration stops when a round about a solution is not likelier than the one before: the scores then scatter with
+    the chain. It also stops far below an earlier round that left what it predicted: poorly determined values can drift
+    together, out of the range of the linearization.
     """
-    now, score = first, -np.inf
+    now, verified, reached = first, -np.inf, -np.inf
     for _ in range(ROUNDS - 1):
         x, settled = next_values(problem, space, now.sets, now.state, x=now.about)
         if settled:
@@ -215,10 +219,10 @@ def _settle(problem: Problem, space: Space, first: _Round, look: Look) -> _Round
             break
         noise, prediction = now.sets.noise, now.sets.form.at(x / space.joined("typical"))
         if noise.unit(new.excess) <= GROWTH * noise.unit(prediction):
-            score = max(score, now.score)
-        if new.score < score - ALTERNATIVE:
+            verified = max(verified, now.score)
+        if new.score < verified - ALTERNATIVE or new.score <= reached:
             break
-        now = new
+        now, reached = new, new.score
     problem.relinearize(space, now.about)
     return now
 
