@@ -164,20 +164,19 @@ def best_of_starts(
 
     `free` (K,) : what is fitted.
     """
-    random, best = (
-        np.random.default_rng(0),
-        minimize(problem, space, space.vector({}) if begin is None else begin, free=free),
-    )
+    random = np.random.default_rng(0)
+    best = minimize(problem, space, space.vector({}) if begin is None else begin, free=free)
     for k in range(STARTS):
         if best.rms < FAR_OFF:
             break
+        # In every second start the plates are near what is declared; in the others a retardance may be any.
         point = random.uniform(-1, 1, space.size) * _widths(space, 180.0 if k % 2 else NOMINAL_DEG)
         best = min(best, minimize(problem, space, point, expansions=0, free=free), key=lambda fit: fit.excess)
     return best
 
 
 def _widths(space: Space, retardance: float) -> Array:
-    """Half widths (K,), degrees, of the starts: retardances of plates of a known order are near what is declared."""
+    """Half widths (K,), degrees, of the starts, that of retardances given."""
 
     def width(candidate: Candidate) -> float:
         if not _anywhere(candidate):

@@ -20,11 +20,13 @@ from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.range_of import RANK
 from processing.diagnosis.search.result import Check, MuellerError
-from processing.diagnosis.search.rules import CHANCE_WORSE, SMALL, SURE
+from processing.diagnosis.search.rules import CHANCE_WORSE, SMALL
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import Changes
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
 
+#: [of the squared error of M] That the stored directions hold of what stays uncertain.
+STORED_SHARE = 0.995
 #: [directions] That are stored at most.
 MOST_STORED = 20
 
@@ -165,7 +167,7 @@ class MuellerErrors:
         largest, products = self.products[int(np.argmax(of_elements))], self.products.sum(axis=0)
         lasts = np.array([c.capture is None for c in self.space.candidates for _ in c.parameters])
         size, directions = _leading(covariance, products, lasts)
-        enough = int(np.searchsorted(np.cumsum(size), SURE * size.sum())) + 1
+        enough = int(np.searchsorted(np.cumsum(size), STORED_SHARE * size.sum())) + 1
         names = tuple(c.name for c in problem.captures)
         several = len(set(problem.wavelengths_nm)) > 1
         slopes = np.sqrt(np.maximum(np.diag(products), 0.0))

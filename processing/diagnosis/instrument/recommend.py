@@ -27,7 +27,6 @@ SAMPLES: dict[str, NDArray[np.float64]] = {
     "a depolarizing white target (integrating sphere)": mueller.IDEAL_DEPOLARIZER,
 }
 
-
 #: Matrix W (L, 16) of a capture in which a candidate acts, and its changes (parameters, L, 16) for typical sizes.
 Slopes = Callable[[Candidate], tuple[Array, Array]]
 
@@ -106,6 +105,7 @@ def _signature(w: Array, dw: Array, sample: Array) -> Array:
 
 
 def _slopes(problem: InstrumentProblem, space: Space, fit: Fit, candidate: Candidate) -> tuple[Array, Array]:
+    """W and its changes by a candidate at the values of a fit; see `Slopes`."""
     capture = next(k for k, w in enumerate(problem.wavelengths_nm) if candidate.acts(k, w))
     joint = Space((*space.candidates, candidate)) if candidate not in space.candidates else space
     values = np.concatenate([fit.values, np.zeros(joint.size - space.size)])

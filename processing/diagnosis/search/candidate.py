@@ -10,7 +10,7 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.search.dispersion import Curve, curve
-from processing.diagnosis.search.rules import NOMINAL_DEG, NOMINAL_PART, NOMINAL_SHARE, SMALL, WINDOW_DEG
+from processing.diagnosis.search.rules import NOMINAL_DEG, NOMINAL_PART, NOMINAL_SHARE, WINDOW_DEG
 from processing.effect import Effect, Parameter
 from processing.errors import ProcessError
 from processing.instrument.applied_effects import instrument_effects
@@ -160,6 +160,10 @@ class Candidate:
         return np.array([p.upper for p in self.parameters])
 
 
+#: [1] How far below its nominal value a gain of a channel, or the level of a source, may be.
+MOST_LOST = 0.95
+
+
 def _nominal(field: str, window: bool) -> Parameter:
     """A nominal value; what has no retardance is a window, and close to that."""
     if field == "azimuth_deg":
@@ -170,7 +174,7 @@ def _nominal(field: str, window: bool) -> Parameter:
     if field == "diattenuation":
         return Parameter(field, "1", -1.0, 1.0, NOMINAL_SHARE)
     if field == "gain":
-        return Parameter(field, "1", SMALL - 1, np.inf, NOMINAL_PART)
+        return Parameter(field, "1", -MOST_LOST, np.inf, NOMINAL_PART)
     return Parameter(field, "1", -NOMINAL_SHARE, 1.0, NOMINAL_PART if field == "extinction" else NOMINAL_SHARE)
 
 
@@ -219,7 +223,7 @@ class SourceLevel(SourceEffect, ValuePerState):
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         states = range(conditions.states)
-        return tuple(Parameter(f"state_{k}", "1", SMALL - 1, np.inf, NOMINAL_SHARE) for k in states)
+        return tuple(Parameter(f"state_{k}", "1", -MOST_LOST, np.inf, NOMINAL_SHARE) for k in states)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.gain = changes.gain * (1 + values)[:, None]

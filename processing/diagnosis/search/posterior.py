@@ -180,15 +180,15 @@ def _of_bends(
     Corrections of counts are expanded about the current values, where the right one may look worse than a wrong one.
     Also returns the alternatives that fit equally well about their own values.
     """
-    rounds, log_likelihood = [first], first.sets.noise.log_likelihood
-    least_likely = log_likelihood(first.sets.fitted(first.state).excess) - 2 * NEEDED
+    rounds, noise = [first], first.sets.noise
+    enough = noise.log_likelihood(first.sets.fitted(first.state).excess) - 2 * NEEDED
     for k in (g for g in bends if first.state.tau[g] > 0):
         for j in (g for g in bends if first.state.tau[g] == 0):
             state = first.sets.without(first.state, k)
             state.tau[j] = first.state.tau[k]
             values, excess = minimum_of(problem, space, first.sets, first.sets.settled(state))
             # What fits far worse about its own values is no alternative, whatever other groups may add.
-            trial = look(values) if log_likelihood(excess) > least_likely else None
+            trial = look(values) if noise.log_likelihood(excess) > enough else None
             rounds += [trial] if trial is not None else []
     best = max(rounds, key=lambda trial: trial.score)
     problem.relinearize(space, best.about)

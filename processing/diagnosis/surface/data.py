@@ -26,6 +26,8 @@ from processing.storage.captures.capture import Capture
 
 #: [pixels] Of an object that are used at most, evenly spread.
 MOST_OF_OBJECT = 4000
+#: [of its radius] Rim of an object that is left out: one off its place would mix object and background there.
+RIM_OF_OBJECT = 0.06
 #: [pixels of the camera] The same, at least: the interpolation of a mosaic mixes as many.
 RIM_PX = 6
 
@@ -175,7 +177,7 @@ def _pick(
         raise ProcessError(f"{data.name}: no pixel sees a lit point of the object at Omega {omega:g} degrees.")
     mean = signal.mean(axis=(0, 1), dtype=np.float64)
     lit = mean > SMALL * np.median(mean[mask])
-    rim = int(np.ceil(max(SMALL * np.sqrt(mask.sum() / np.pi), RIM_PX / (cell * data.binned))))
+    rim = int(np.ceil(max(RIM_OF_OBJECT * np.sqrt(mask.sum() / np.pi), RIM_PX / (cell * data.binned))))
     inside = ndimage.binary_erosion(mask & lit, iterations=rim)
     good = inside & data.usable & ~ndimage.binary_dilation(data.clipped, iterations=1)
     # Neighbours of an interpolated mosaic share pixels; every second one does not.
