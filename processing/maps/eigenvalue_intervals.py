@@ -130,17 +130,17 @@ def entropy_of(xi: Array) -> Array:
     return np.asarray(entropy(np.moveaxis(physical / physical.sum(axis=0), 0, -1)))
 
 
-def set_symmetric(planes: Planes, relative: Array, components: float) -> None:
+def set_symmetric(planes: Planes, unit: Array, components: float) -> None:
     """Elements of the symmetric decomposition are sorted singular values, which noise pushes apart and away from 0.
 
     Parameters
     ----------
-    relative : (...), root mean square error of an element other than m00, over m00.
+    unit : (...), noise of an element of the matrix whose singular values they are, see `symmetric.noise_of_core`. Their
+        own errors are no measure of it: noise turns the singular vectors to where it is largest.
     components : directions that their noise has, see `sorted_eigenvalues.block_components`.
     """
     names = [f"symmetric_d{k}" for k in (1, 2, 3)]
     value, error = (np.stack([planes[f"{n}{end}"] for n in names]).astype(float) for end in ("", "_errors"))
-    unit = np.maximum(np.sqrt(np.mean(np.square(error), axis=0)), relative)
     shifts = of_singular_values(value, error, unit, components)
     value = value + shifts.middle
     for k, name in enumerate(names):

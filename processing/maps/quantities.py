@@ -31,7 +31,7 @@ from processing.maps.xi0 import is_valid
 from processing.polarization import gradients
 from processing.polarization.decompositions.differential import differential
 from processing.polarization.decompositions.lu_chipman import lu_chipman
-from processing.polarization.decompositions.symmetric import symmetric
+from processing.polarization.decompositions.symmetric import noise_of_core, symmetric
 from processing.polarization.eigenvalue_noise import corrected
 from processing.polarization.propagation import Derived
 from processing.polarization.quantities import PAPER_PAIRS
@@ -233,7 +233,8 @@ def _cached_block(
         derived |= {name: scalar.derived(m) for name, scalar in scalar_quantities().items()}
         derived |= gradients.pairs(m, pairs)
         if "symmetric" in extra:
-            derived |= gradients.symmetric_quantities(lit)
+            factors = symmetric(lit)
+            derived |= gradients.symmetric_quantities(lit, factors)
         if "differential" in extra:
             derived |= gradients.differential_quantities(lit)
         planes: dict[str, NDArray[Any]] = {}
@@ -247,7 +248,8 @@ def _cached_block(
         retardance = of_slopes(image.covariance(), vector.value, vector.gradient)
         planes["retardance_vector_covariance"] = retardance.packed[[0, 1, 2, 3, 5, 4]].astype(np.float32)
         polar = lu_chipman(m)
-        _set_intervals(planes, derived, m, image, depolarizer=polar.depolarizer, retardance=retardance)
+        of_core = noise_of_core(factors, image.covariance()) if "symmetric" in extra else None
+        _set_intervals(planes, derived, m, image, depolarizer=polar.depolarizer, retardance=retardance, of_core=of_core)
         if moves is not None:
             moved = set_systematic(planes if by_input is None else dict(planes), derived, moves)
             if by_input is not None:
@@ -256,7 +258,7 @@ def _cached_block(
     planes["lu_chipman_defined"] = polar.defined.astype(np.uint8)
     planes["negative_determinant"] = polar.negative_determinant.astype(np.uint8)
     if "symmetric" in extra:
-        planes["symmetric_defined"] = symmetric(lit).defined.astype(np.uint8)
+        planes["symmetric_defined"] = factors.defined.astype(np.uint8)
     if "differential" in extra:
         planes["differential_defined"] = differential(lit).defined.astype(np.uint8)
     return planes
@@ -270,6 +272,7 @@ def _set_intervals(
     *,
     depolarizer: NDArray[np.floating],
     retardance: VectorNoise,
+    of_core: NDArray[np.float64] | None,
 ) -> None:
     """Intervals that first order does not give: see `processing.maps.intervals`."""
     error, linear_error = planes["retardance_deg_errors"], planes["retardance_linear_deg_errors"]
@@ -303,8 +306,8 @@ def _set_intervals(
     set_depolarization_power(planes, passed > least)
     if "differential_retardance_deg" in planes:
         set_differential(planes, is_determined & _is_principal(planes))
-    if "symmetric_d1" in planes:
-        set_symmetric(planes, _relative_error(image), components)
+    if of_core is not None:
+        set_symmetric(planes, of_core, components)
     set_ratios(planes, derived, image, m[..., 0, 0])
     if isinstance(image, MuellerImage):
         set_entropy(planes, shrunk, derived["coherency_eigenvalues"].gradient, image)

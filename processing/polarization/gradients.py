@@ -13,7 +13,7 @@ from processing.polarization import quantities
 from processing.polarization.cloude import cloude, xi0_and_dominant
 from processing.polarization.decompositions.differential import differential, differential_slopes
 from processing.polarization.decompositions.lu_chipman import depolarization_power, lu_chipman
-from processing.polarization.decompositions.symmetric import G, symmetric
+from processing.polarization.decompositions.symmetric import G, Symmetric, symmetric
 from processing.polarization.propagation import Derived, numeric_gradient
 from processing.polarization.quantities import NamedStokes
 
@@ -146,14 +146,14 @@ def lu_chipman_quantities(m: RealArray) -> dict[str, Derived]:
     return found | {"retardance_axis_or_90_deg": either, "retardance_vector_deg": vector}
 
 
-def symmetric_quantities(m: RealArray) -> dict[str, Derived]:
+def symmetric_quantities(m: RealArray, found: Symmetric | None = None) -> dict[str, Derived]:
     """Diagonal of the symmetric decomposition's depolarizer over its first element; NaN where not defined.
 
     The squares of the four elements are the eigenvalues of N = M^T G M G up to one factor; with N v = lambda v the left
     eigenvector is G v, so d lambda = 2 (G M G v)^T dM (G v) / (v^T G v).
     """
     m = np.asarray(m, dtype=float)
-    found = symmetric(m)
+    found = found or symmetric(m)
     safe = np.where(found.defined[..., None, None], m, np.diag([1.0, 0.5, 0.4, 0.3]))
     values, vectors = np.linalg.eig(np.swapaxes(safe, -1, -2) @ G @ safe @ G)
     order = np.argsort(-values.real, axis=-1)

@@ -69,6 +69,24 @@ def symmetric(m: RealArray) -> Symmetric:
     return Symmetric(d2, r2, depolarizer, r1, d1, defined)
 
 
+def noise_of_core(found: Symmetric, covariance: RealArray) -> NDArray[np.float64]:
+    """Root mean square error (...) of the nine elements between the diattenuators, over element 0 of the depolarizer.
+
+    Their singular values are the other elements. The retarders turn the nine, which changes no mean of squares.
+
+    Parameters
+    ----------
+    covariance : (..., 16, 16), of the elements of the matrix.
+    """
+    weights = []
+    for d in (found.diattenuator_2, found.diattenuator_1):
+        inverse = (G @ d @ G)[..., 1:, :] / (1 - np.sum(np.square(d[..., 0, 1:]), axis=-1))[..., None, None]
+        weights.append(np.swapaxes(inverse, -1, -2) @ inverse)
+    each = covariance.reshape(*covariance.shape[:-2], 4, 4, 4, 4)
+    total = np.einsum("...ac,...bd,...abcd->...", *weights, each, optimize=True)
+    return np.asarray(np.sqrt(total) / 3 / found.depolarizer[..., 0, 0], dtype=float)
+
+
 def _eigen_diattenuation(n: RealArray) -> tuple[RealArray, NDArray[np.bool_]]:
     """Vector part D of the eigenvector (1, D) of the largest eigenvalue, and whether it is a Stokes vector."""
     values, vectors = np.linalg.eig(n)
