@@ -74,7 +74,7 @@ def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, estimate: CorrectedX
     return shrunk
 
 
-def set_entropy(planes: Planes, xi: Array, slopes: RealArray, image: MuellerImage) -> None:
+def set_entropy(planes: Planes, xi: Array, slopes: RealArray, of_index: RealArray, *, image: MuellerImage) -> None:
     """Entropy of eigenvalues (4, ...) whose deviations have lost what noise adds. All others are done.
 
     It follows the depolarization index, which has an interval where entropy is bent: near 0 and 1. What noise does at
@@ -82,7 +82,7 @@ def set_entropy(planes: Planes, xi: Array, slopes: RealArray, image: MuellerImag
 
     Parameters
     ----------
-    slopes : (4, ..., 16), gradients of the eigenvalues.
+    slopes, of_index : (4, ..., 16) and (..., 16), gradients of the eigenvalues and of the index.
     """
     index, error = (planes[f"depolarization_index{end}"].astype(float) for end in ("", "_errors"))
     bounds = planes["depolarization_index_95"].astype(float)
@@ -102,10 +102,16 @@ def set_entropy(planes: Planes, xi: Array, slopes: RealArray, image: MuellerImag
         return entropy_of(pure + share * (0.25 + pattern * np.maximum(of_index, 0) - pure))
 
     by_eigenvalue = -np.log(np.maximum(xi, planes["coherency_eigenvalues_errors"])) / np.log(4)
-    total = image.variance_of(np.einsum("k...,k...i->...i", by_eigenvalue, slopes))
+    slope = np.einsum("k...,k...i->...i", by_eigenvalue, slopes)
     middle, ends = at(index), []
-    by_index = np.fmax(*(np.abs(at(index + side * error) - middle) for side in (-1, 1)))
-    apart = np.sqrt(np.maximum(total - np.square(by_index), 0))
+    by_index = np.square(np.fmax(*(np.abs(at(index + side * error) - middle) for side in (-1, 1))))
+    is_cut = index > 1 - error
+    if is_cut.any():
+        # The curve ends at a pure sample; the covariance with the index does not.
+        moved = image.covariance_with(of_index)
+        shared, variance = (np.einsum("...i,...i->...", moved, each) for each in (slope, of_index))
+        by_index = np.where(is_cut, np.fmax(by_index, np.square(shared) / variance), by_index)
+    apart = np.sqrt(np.maximum(image.variance_of(slope) - by_index, 0))
     for side, end in ((-1, 1), (1, 0)):
         of_95 = np.abs(bounds[end] - index) / NORMAL_95
         levels = ((1.0, index - side * error, error), (NORMAL_95, bounds[end], of_95))

@@ -315,6 +315,15 @@ def test_entropy_of_pure_samples_covers_not_much_too_often() -> None:
     assert min(covered) > 0.64
 
 
+def test_entropy_next_to_a_pure_sample_has_the_noise_of_the_index_once() -> None:
+    """A part of it counted as noise beside the index: 68 % intervals of retarders covered 80 to 82 %."""
+    samples = ["retarder 90", "retarder 178"]
+    table = cells("60 and 150 degrees, 4.3 to 1, 36", 1, 200, 1000, samples=samples, extra=())
+    found = [c for c in table if c.quantity == "entropy"]
+    assert len(found) == 2
+    assert all(0.64 < c.in_68 < 0.76 and c.in_95 > 0.93 for c in found), found
+
+
 @pytest.mark.parametrize(("instrument", "electrons"), [("RGB950's 40", 2000), ("24 others", 60)])
 def test_entropy_covers_at_both_its_ends_and_where_an_eigenvalue_may_be_zero(instrument: str, electrons: float) -> None:
     """95 % intervals covered 87 to 89 %; a pure sample's estimate was above the truth by its error."""
