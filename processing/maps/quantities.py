@@ -29,7 +29,6 @@ from processing.maps.quantity_planes import NOISE, planes_of, with_errors
 from processing.maps.stokes_vector import OF_MATRICES, is_stokes_vector, light_block, light_facts, light_planes
 from processing.maps.xi0 import is_valid
 from processing.polarization import gradients
-from processing.polarization.decompositions.differential import differential
 from processing.polarization.decompositions.lu_chipman import lu_chipman
 from processing.polarization.decompositions.symmetric import noise_of_core, symmetric
 from processing.polarization.eigenvalue_noise import corrected
@@ -260,7 +259,7 @@ def _cached_block(
     if "symmetric" in extra:
         planes["symmetric_defined"] = factors.defined.astype(np.uint8)
     if "differential" in extra:
-        planes["differential_defined"] = differential(lit).defined.astype(np.uint8)
+        planes["differential_defined"] = np.isfinite(derived["differential_depolarization_1"].value).astype(np.uint8)
     return planes
 
 
