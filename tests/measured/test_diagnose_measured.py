@@ -137,6 +137,23 @@ def test_terms_of_even_wavelengths_predict_whole_states_of_odd_ones(public_files
     assert 0.05 < 100 * np.sqrt((error**2).mean(axis=1)).mean() < 0.15
 
 
+def test_values_at_a_bound_leave_the_others_at_their_minimum(public_files, configs, tmp_path):
+    """Of depolarizations that noise takes below what is possible, and a retardance that is far off."""
+    instrument = configs / "instruments/dual_beam_charis.yaml"
+    model = InstrumentModel.load(instrument)
+    paths = [path for _, path in sorted(telescope(public_files, tmp_path, instrument).items())][::2]
+    models, data = [], []
+    for path in paths:
+        with Capture(path) as capture:
+            models.append(model.nominal_at(capture.header.wavelength_nm))
+            data.append(read_capture(capture, models[-1]))
+    bench = WholeBench(InstrumentProblem(models, data), print)
+    start = bench.base.vector(bench.start)
+    fit = minimize(bench.problem, bench.base, start)
+    assert np.any((fit.values <= bench.base.joined("lower")) | (fit.values >= bench.base.joined("upper")))
+    assert fit.rms < 1.001 * minimize(bench.problem, bench.base, start, steps=200).rms
+
+
 def one_detector(public_files, folder: Path, instrument: Path, wavelength_nm: int, beside: int) -> Path:
     """Capture of air, the mean of so many rows (2 nm apart) on both sides of a wavelength."""
     (file,) = public_files("drr-single-detector-vis").values()

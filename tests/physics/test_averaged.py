@@ -72,8 +72,9 @@ def fitted(configs, tmp_path_factory):
     for each in (data, averaged(data, 2)):
         problem = InstrumentProblem(model, [each])
         space = Space(tuple(c for c in problem.pool() if c.kind in ("psa_azimuth", "image_drift")))
-        fit = minimize(problem, space, np.zeros(space.size))
-        fits.append((fit.values, np.sqrt(np.diag(np.linalg.inv(fit.sums.curvature.sum(axis=0))))))
+        values = minimize(problem, space, np.zeros(space.size)).values
+        curvature = problem.sums(space, values).curvature.sum(axis=0)
+        fits.append((values, np.sqrt(np.diag(np.linalg.inv(curvature)))))
     return fits
 
 

@@ -18,7 +18,7 @@ from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.instrument.initial_values import best_of_starts
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.fit import minimize
-from processing.diagnosis.search.rules import LIMIT, NEEDED
+from processing.diagnosis.search.rules import LIMIT, NEEDED, TAU
 from processing.diagnosis.search.space import Space
 from processing.effect import EffectError
 from processing.instrument.model import InstrumentModel
@@ -61,10 +61,18 @@ def find_miswiring(problem: InstrumentProblem, declared: InstrumentModel | None 
 
 
 def _fits_better(problem: InstrumentProblem, rewired: InstrumentProblem) -> bool:
-    """Whether values of the train as it is declared leave far less than another train does as it stands."""
-    space = Space(tuple(c for c in problem.pool() if c.shifts(problem.model)))
-    values = minimize(problem, space, np.zeros(space.size)).values
-    return _chi2(problem, space, values) * WIRING < _chi2(rewired, Space(()), np.zeros(0))
+    """Whether values of the train explain as much as a mistake with others does, and need no more implausible ones.
+
+    In air two axes in each other's place do what four far values do. The mistake itself counts as one of them.
+    """
+
+    def fitted(tried: InstrumentProblem) -> tuple[float, int]:
+        space = Space(tuple(c for c in tried.pool() if c.shifts(tried.model)))
+        values = minimize(tried, space, np.zeros(space.size)).values
+        return _chi2(tried, space, values), int(np.sum(np.abs(values) > TAU[-1] * space.joined("typical")))
+
+    (left, far), (left_there, far_there) = fitted(problem), fitted(rewired)
+    return left * WIRING < left_there or (left < WIRING * left_there and far <= far_there + 1)
 
 
 def find_train_miswiring(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:

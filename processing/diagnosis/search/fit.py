@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,9 @@ from processing.diagnosis.search.space import Problem, Space, Sums
 LEAST_FREEDOM = 0.2
 #: [steps] Of a fit.
 STEPS = 15
-#: [chi-square] The fit ends when a step gains less than this.
+#: [exchanges] Of many values at once at their bounds that may not help, before one value is exchanged at a time.
+BLOCKS = 3
+#: [chi-square, in the unit of what is left over] The fit ends when a step gains less than this.
 LEAST_GAIN = 0.05
 
 
@@ -50,15 +52,14 @@ def minimize(
     free: NDArray[np.bool_] | None = None,
     steps: int = STEPS,
     expansions: int = ROUNDS,
-    least_gain: float = LEAST_GAIN,
     weak: Array | None = None,
     at_start: Sums | None = None,
 ) -> Fit:
     """Least chi-square over its stretch by Levenberg-Marquardt with bounds, on the data of the folds given.
 
-    It ends when a step gains less than `least_gain`. `weak` (K,) is the curvature of the prior; default: `prior`. Some
-    values may be held, others are `free` (K,). Corrections of counts are expanded about the start, and at most
-    `expansions` times anew about where the fit ended. `at_start`: the sums at the start, if they are known.
+    `weak` (K,) is the curvature of the prior; default: `prior`. Some values may be held, others are `free` (K,).
+    Corrections of counts are expanded about the start, and at most `expansions` times anew about where the fit ended.
+    `at_start`: the sums at the start, if they are known. Those of the fit may be without derivatives.
     """
     weak = prior(space) if weak is None else weak
     use = list(range(problem.folds) if folds is None else folds)
@@ -67,9 +68,7 @@ def minimize(
     for _ in range(1 + (expansions if folds is None else 0)):
         if folds is None and not problem.relinearize(space, start) and fit is not None:
             break
-        fit = _descend(
-            problem, space, start, use, free=move, steps=steps, least_gain=least_gain, weak=weak, sums=at_start
-        )
+        fit = _descend(problem, space, start, use, free=move, steps=steps, weak=weak, sums=at_start)
         start, at_start = fit.values, None
     assert fit is not None
     return fit
@@ -83,7 +82,6 @@ def _descend(
     *,
     free: NDArray[np.bool_],
     steps: int,
-    least_gain: float,
     weak: Array,
     sums: Sums | None,
 ) -> Fit:
@@ -97,29 +95,63 @@ def _descend(
         unit = sums.excess[use].sum() / max(float(sums.freedom[use].sum()), 1e-300)
         g = sums.gradient[use].sum(axis=0) - unit * sums.stretch[use].sum(axis=0) + weak * x
         h = sums.curvature[use].sum(axis=0) + np.diag(weak)
-        move = free & ~((x <= lower) & (g > 0)) & ~((x >= upper) & (g < 0))
-        gm, hm = g[move], h[np.ix_(move, move)]
-        if not move.any():
+        if not free.any():
             break
+        enough = LEAST_GAIN + RANK * abs(cost)
         while True:
-            step = np.zeros_like(x)
-            step[move] = -np.linalg.solve(hm + damping * np.diag(np.diag(hm)), gm)
-            if not damping and -gm @ step[move] < least_gain + RANK * abs(cost):
+            # Values that the data hardly tell are those that go too far, where nothing is straight: they are held by
+            # their prior. In units of the curvature, which others give them, they would creep.
+            step = _bounded_step(g, h + damping * np.diag(weak), lower - x, upper - x, free=free)
+            if not damping and -step @ (2 * g + h @ step) < enough:
                 return Fit(x, sums, float(sums.excess[use].sum()))
             tried = np.clip(x + step, lower, upper)
-            # Derivatives are most of the work; a step that is refused needs none.
-            now = _penalize(problem.sums(space, tried, derivatives=False), weak, tried, use, reference=reference)
-            if now <= cost or damping > 1 / NEARLY_ZERO:
+            # Derivatives are most of the work; a step that is refused needs none, and neither does the last one.
+            new = problem.sums(space, tried, derivatives=False)
+            now = _penalize(new, weak, tried, use, reference=reference)
+            if now <= cost or damping > 1 / NEARLY_ZERO**2:
                 break
-            damping = max(10 * damping, LITTLE)
+            damping = max(10 * damping, 1.0)
         # Also where the sum is no number: so far away that the model has no intensities.
         if not now <= cost:
             break
-        gain, x, cost, sums = cost - now, tried, now, problem.sums(space, tried)
-        damping = damping / 10 if damping > LITTLE else 0.0
-        if gain < least_gain + RANK * abs(cost):
+        gain, x, cost, sums = cost - now, tried, now, new
+        if gain < enough:
             break
+        sums = problem.sums(space, x)
+        damping = damping / 10 if damping > LITTLE else 0.0
     return Fit(x, sums, float(sums.excess[use].sum()))
+
+
+def _with_slopes(problem: Problem, space: Space, fit: Fit) -> Fit:
+    """The fit, its sums with derivatives."""
+    return fit if fit.sums.gradient.shape[1] == space.size else replace(fit, sums=problem.sums(space, fit.values))
+
+
+def _bounded_step(g: Array, h: Array, lowest: Array, highest: Array, *, free: BoolArray) -> Array:
+    """Step (K,) to the minimum of 2 g . s + s . h . s between two bounds (K,); all but the `free` values (K,) stay.
+
+    Beside a value that is cut back at its bound, the others would be where they made up for it. So values are held at a
+    bound, or let go, until none passes one and none is held back from less (block principal pivoting; Portugal, Judice
+    and Vicente, Math. Comput. 63, 625, 1994).
+    """
+    step, fewest, tries = np.zeros_like(g), g.size + 1, BLOCKS
+    side = np.where((lowest >= 0) & (g > 0), -1, np.where((highest <= 0) & (g < 0), 1, 0))
+    while True:
+        moves = free & (side == 0)
+        step[free] = np.choose(side[free] + 1, [lowest[free], 0.0, highest[free]])
+        rest = g[moves] + h[np.ix_(moves, ~moves)] @ step[~moves]
+        step[moves] = -np.linalg.solve(h[np.ix_(moves, moves)], rest)
+        slope = g + h @ step
+        wanted = np.where(moves, np.where(step < lowest, -1, np.where(step > highest, 1, 0)), side)
+        wanted[free & (side * slope > 0)] = 0
+        differ = np.flatnonzero(wanted != side)
+        if not differ.size:
+            return step
+        # If blocks do not help, one value at a time does in the end.
+        tries = BLOCKS if differ.size < fewest else tries - 1
+        fewest = min(fewest, differ.size)
+        chosen = differ if tries > 0 else differ[-1:]
+        side[chosen] = wanted[chosen]
 
 
 def _penalize(sums: Sums, weak: Array, values: Array, use: Sequence[int], *, reference: float) -> float:
@@ -187,6 +219,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
     `weak` (K,) is the curvature of the prior; default: `prior`.
     """
     weak = prior(space) if weak is None else weak
+    full = _with_slopes(problem, space, full)
     if problem.folds == 1:
         return _in_sample(space, full, weak)
     by_state = problem.holds_out_states
@@ -200,7 +233,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
         values = minimize(problem, space, full.values, training_folds, weak=weak, at_start=full.sums).values
         if local.any():
             start = np.where(local, full.values, values)
-            fit = minimize(problem, space, start, [fold], free=local, steps=3)
+            fit = _with_slopes(problem, space, minimize(problem, space, start, [fold], free=local, steps=3))
             determined = _count_determined(fit.sums.curvature[fold], weak, local)
             spent += determined
             total[3] -= determined.sum()
