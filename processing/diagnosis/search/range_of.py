@@ -28,16 +28,16 @@ def inside_and_outside(a: Array) -> tuple[Array, Array]:
     return u[:, :rank], u[:, rank:]
 
 
-def part_outside(a: Array, b: Array) -> float:
-    """Part of a signature a (L, K) that another one, b (L, M), does not reach: the sine of their angle."""
-    u, norm = range_of(b), float(np.linalg.norm(a))
-    return float(np.linalg.norm(a - u @ (u.T @ a)) / norm) if norm else 0.0
-
-
 def least_apart(signatures: Sequence[Array]) -> float:
-    """Smallest sine between two of some signatures (L, K), one where there are not two."""
-    pairs = permutations(signatures, 2)
-    return min((part_outside(first, second) for first, second in pairs), default=1.0)
+    """Smallest sine between two of some signatures (L, K), one where there are not two.
+
+    It is the part of one, relative to its norm, that another does not reach.
+    """
+    if len(signatures) < 2:
+        return 1.0
+    norms = [float(np.linalg.norm(a)) for a in signatures]
+    pairs = permutations(zip(signatures, norms, map(range_of, signatures), strict=True), 2)
+    return min(float(np.linalg.norm(a - u @ (u.T @ a))) / norm if norm else 0.0 for (a, norm, _), (_, _, u) in pairs)
 
 
 def rank_of(a: Array) -> int:

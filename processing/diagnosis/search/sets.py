@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dlauum, dtrtri, dtrtrs
 
 from processing.arrays import Array
-from processing.diagnosis.search.rules import MANY, TAU, TAU_WEIGHT, TAU_WEIGHT_OF_MANY
+from processing.diagnosis.search.rules import LITTLE, MANY, TAU, TAU_WEIGHT, TAU_WEIGHT_OF_MANY
 
 #: [log odds] Of an impossible set, below the evidence of any data.
 NEVER = -1e9
@@ -167,7 +168,8 @@ class Sets:
         """The state with the unit of its residual."""
         for _ in range(4):
             before, state.unit = state.unit, float(self.noise.unit(self._excess(state)))
-            if state.unit == before:
+            # About the likeliest unit the score is flat.
+            if abs(state.unit - before) <= LITTLE * before:
                 break
         return state
 
@@ -304,8 +306,9 @@ class Sets:
         """Groups of one size, with curvature (G, n, n) and gradient (G, n) about zero given all other groups."""
         where = np.full(self.size, -1)
         where[fit.active] = np.arange(fit.active.size)
-        # What the groups that are there take from each value.
-        taken = self.form.curvature[fit.active].T @ (inverse.T / state.unit)
+        # What the groups that are there take from each value; the inverse is a triangle.
+        across = np.take(self.form.curvature, fit.active, axis=1).T
+        taken = (dtrmm(1 / state.unit, inverse, across, lower=1, overwrite_b=1) if fit.active.size else across).T
         for members, index, own_curvature in self._alike:
             s, q = own_curvature / state.unit, self.form.gradient[index] / state.unit
             is_included = state.tau[members] > 0
