@@ -150,7 +150,8 @@ def test_what_is_found_and_not_used_is_uncertain_as_a_whole():
     )
     space = Space((drift, path))
     direction = (np.array([0, 1]), np.eye(2))
-    errors = MuellerErrors(space, np.array([1.0, 4.0]), np.diag([0.01, 0.09]), np.zeros((16, 2, 2)), (direction,))
+    none = np.zeros((0, 2, 2))
+    errors = MuellerErrors(space, np.array([1.0, 4.0]), np.diag([0.01, 0.09]), np.zeros((16, 2, 2)), (direction,), none)
     used = Some(space=Space((drift,)), fit=Some(values=np.array([1.0])))
     assert errors.corrected_values(used).tolist() == [1.0, 0.0]
     change = errors._change(*direction[:1], errors.corrected_values(used), direction[1])

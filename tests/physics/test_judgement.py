@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.mueller_error import chances, lasts
+from processing.diagnosis.instrument.mueller_error import chance_later, chances, lasts
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.decision import Judgement, PredictedChange, predicted_change
 from processing.diagnosis.search.fit import Fit, HeldOut, Solution
@@ -104,6 +104,17 @@ def test_nothing_that_is_changed_makes_nothing_worse() -> None:
     assert predicted_change(np.array([1e-9]), np.array([1e-9]), np.eye(1), np.eye(1)).chance_worse == 0
 
 
+def test_what_this_sample_shows_of_a_correction_is_not_what_another_one_does() -> None:
+    """One of two values is known, and this sample shows that one alone; a third sample shows nothing."""
+    mean, covariance = np.array([1.0, 0.1]), np.diag([1e-4, 1.0])
+    shown = (np.diag([1.0, 0.0]), np.diag([0.0, 1.0]), np.zeros((2, 2)))
+    here, there, nowhere = (predicted_change(mean, mean, covariance, products) for products in shown)
+    assert here.chance_worse < 1e-6
+    assert there.chance_worse == pytest.approx(0.48, abs=0.01)
+    assert chance_later((here, there, nowhere)) == pytest.approx(0.24, abs=0.01)
+    assert chance_later((nowhere,)) == 0
+
+
 def _solved(before: list[float], after: list[float]) -> Solution:
     """A correction that leaves so much excess of each capture."""
     held = [HeldOut(sum(x), 1.0, 1.0, 1.0, np.array([[1.0, 1.0, e, 1.0] for e in x])) for x in (before, after)]
@@ -112,19 +123,19 @@ def _solved(before: list[float], after: list[float]) -> Solution:
 
 
 def test_of_captures_whose_sample_changed_the_others_bear_a_correction_out() -> None:
-    assert lasts(NOTHING, _solved([100.0], [0.0]))
-    assert not lasts(NOTHING, _solved([100.0], [0.0]), {0})
-    assert lasts(NOTHING, _solved([100.0, 50.0], [0.0, 0.0]), {0})
-    assert not lasts(NOTHING, _solved([100.0, 50.0], [0.0, 55.0]), {0})
-    assert not lasts(NOTHING, _solved([100.0, 50.0], [0.0, 0.0]), {0, 1})
-    names = [check.name for check in chances(NOTHING, NOTHING, lasting=False, each={})]
+    assert lasts((NOTHING,), _solved([100.0], [0.0]))
+    assert not lasts((NOTHING,), _solved([100.0], [0.0]), {0})
+    assert lasts((NOTHING,), _solved([100.0, 50.0], [0.0, 0.0]), {0})
+    assert not lasts((NOTHING,), _solved([100.0, 50.0], [0.0, 55.0]), {0})
+    assert not lasts((NOTHING,), _solved([100.0, 50.0], [0.0, 0.0]), {0, 1})
+    names = [check.name for check in chances(NOTHING, (NOTHING,), lasting=False, each={})]
     assert names[-1].endswith("so it is written for these captures alone")
 
 
 def test_what_a_correction_does_to_each_of_several_captures_is_told_and_does_not_decide() -> None:
     flat = predicted_change(np.array([1e-3]), np.array([1e-3]), np.array([[1e-6]]), np.eye(1))
     *_, air, flat_check = chances(
-        NOTHING, NOTHING, lasting=True, each={"air (air.h5)": NOTHING, "flat (flat.h5)": flat}
+        NOTHING, (NOTHING,), lasting=True, each={"air (air.h5)": NOTHING, "flat (flat.h5)": flat}
     )
     assert air.name == "predicted error of M/m00 of air (air.h5), rms (it grows with a chance of less than 0.0001)"
     assert flat_check.name == "predicted error of M/m00 of flat (flat.h5), rms (it grows with a chance of 0.31)"

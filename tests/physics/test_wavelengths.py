@@ -161,7 +161,7 @@ def test_what_the_intensities_do_not_tell_of_m_is_no_error_of_the_instrument(pro
     values = np.zeros(space.size)
 
     def of_all(remainder=None):
-        return sum(products.sum(axis=0) for _, products in mueller_slopes(problem, space, values, remainder))
+        return sum(products.sum(axis=0) for _, products, _ in mueller_slopes(problem, space, values, remainder))
 
     full, half, none = (of_all(np.full(3, x)) for x in (1.0, 1e3, 1e9))
     assert full == pytest.approx(of_all())

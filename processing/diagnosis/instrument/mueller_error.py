@@ -6,7 +6,7 @@ not applied and remain in this error. So does what was found and is not used.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -14,14 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
+from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES, features
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.recommend import SAMPLES
 from processing.diagnosis.search.decision import Along, PredictedChange, chance_checks, predicted_change
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.range_of import RANK
 from processing.diagnosis.search.result import Check, MuellerError
 from processing.diagnosis.search.rules import CHANCE_WORSE, SMALL
-from processing.diagnosis.search.space import Space
+from processing.diagnosis.search.space import Acting, Space
 from processing.instrument.changes import Changes
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
 
@@ -32,11 +34,12 @@ MOST_STORED = 20
 
 
 def mueller_slopes(
-    problem: InstrumentProblem, space: Space, values: Array, rms: Array | None = None
-) -> Iterator[tuple[NDArray[np.int64], Array]]:
+    problem: InstrumentProblem, space: Space, values: Array, rms: Array | None = None, *, samples: Sequence[Array] = ()
+) -> Iterator[tuple[NDArray[np.int64], Array, Array]]:
     """For each capture: the J values that act on it, and products (16, J, J) of the slopes of each element of M/m00.
 
     A common factor of M is left out. Products are means over the 15 elements, and over the pixels by their brightness.
+    The third are products (S, J, J) over all elements, for samples M/m00 (16,) in the place of this one.
     `rms` (captures,) is what the intensities of each are known to, in units of noise (default: 1). What they do not
     tell of M, within the size of its elements, is not made wrong by an instrument either.
     """
@@ -44,34 +47,80 @@ def mueller_slopes(
     problem, values = problem.near(space, values)
     for k, moments in enumerate(problem.moments):
         acting = space.acting(k, problem.wavelengths_nm[k])
-        subspace, local = acting.space, acting.of(values)
-        products, light = np.zeros((16, acting.index.size, acting.index.size)), 0.0
-        changes = problem.changes(k, subspace, local)
-        columns = partial(_all_columns, problem, k)
+        slopes = _SlopesOfPixels.of(problem, k, acting, values)
+        blocks = moments.blocks[:: problem.folds if moments.tiles is None else 1]
+        each = [slopes.products(slopes.joined(b.z), b.z, rms[k] ** 2 * b.pixels) for b in blocks]
+        light = max(sum(bright for _, bright in each), 1e-300)
+        own = np.sum([part for part, _ in each], axis=0) / (light * 15)
+        # Another sample has the light of this one.
+        level = float(np.mean(problem.captures[k].signal[..., problem.captures[k].usable]))
+        others = np.zeros((len(samples), *own.shape[1:]))
+        for n, sample in enumerate(samples):
+            part, bright = slopes.products(*slopes.even(sample, level), 0.0)
+            others[n] = part.sum(axis=0) / (bright * 15)
+        yield acting.index, acting.spread_products(own), acting.spread_products(others)
+
+
+@dataclass(frozen=True, eq=False)
+class _SlopesOfPixels:
+    """What J values do to M of pixels in a capture: through rows w (L, 16) of their noise, and counts of scale (L, 1).
+
+    `dw` (J, L, 16), `dc` (J, F, L) : slopes of the rows, and of the coefficients c (F, L) of features of the counts.
+    `counts` (L,) : rows that count; `free` : channels that share a level in each state, if they do.
+    """
+
+    w: Array
+    c: Array
+    dw: Array
+    dc: Array
+    scale: Array
+    counts: NDArray[np.bool_]
+    free: int | None
+
+    @classmethod
+    def of(cls, problem: InstrumentProblem, k: int, acting: Acting, values: Array) -> _SlopesOfPixels:
+        """Of the values (K,) of a problem that are acting on its capture k."""
+        space, local, moments = acting.space, acting.of(values), problem.moments[k]
+        changes, columns = problem.changes(k, space, local), partial(_all_columns, problem, k)
         w, c = columns(changes), problem.coefficients(k, changes)
-        u, size, vt = _decompose(w * moments.counts[:, None])
-        dw, dc = problem.slopes(k, subspace, local, w, columns=columns), problem.slopes_of_counts(k, subspace, local, c)
-        scale = 1 / moments.sigma[:, None]
-        for block in moments.blocks[:: problem.folds if moments.tiles is None else 1]:
-            y = np.einsum("fl,flr->lr", c, block.z) * scale
-            m00 = (vt[:, 0] / size) @ (u.T @ y)
-            # The best linear estimate of elements that are as large as m00 at most.
-            unknown = rms[k] ** 2 * block.pixels / max(float(m00 @ m00), 1e-300)
+        dw, dc = problem.slopes(k, space, local, w, columns=columns), problem.slopes_of_counts(k, space, local, c)
+        free = problem.channels(k) if problem.has_free_level(k) else None
+        return cls(w, c, dw, dc, 1 / moments.sigma[:, None], moments.counts, free)
+
+    def joined(self, z: Array) -> Array:
+        """Corrected counts (L, R), in units of their noise, of features (F, L, R)."""
+        return np.asarray(np.einsum("fl,flr->lr", self.c, z) * self.scale)
+
+    def even(self, sample: Array, level: float) -> tuple[Array, Array]:
+        """Counts (L, 1) of an even sample M/m00 (16,), of a mean level, and their features (F, L, 1)."""
+        signal = self.w @ sample[:, None] / self.scale
+        signal *= level / float(np.mean(signal))
+        z = np.zeros((len(FEATURES), *signal.shape))
+        z[:-DERIVATIVES] = features(signal, np.zeros(1), np.zeros(1))[0]
+        return signal * self.scale, z
+
+    def products(self, y: Array, z: Array, noise: float) -> tuple[Array, float]:
+        """Products (16, J, J) of the slopes of counts y (L, R) of features z (F, L, R), and the square of m00.
+
+        `noise` : summed square of what they are known to.
+        """
+        w = self.w * self.counts[:, None]
+        u, size, vt = _decompose(w)
+        m00 = (vt[:, 0] / size) @ (u.T @ y)
+        # The best linear estimate of elements that are as large as m00 at most.
+        unknown = noise / max(float(m00 @ m00), 1e-300)
+        back = (vt.T * (size / (size**2 + unknown))) @ u.T
+        m = back @ y
+        if self.free:
+            # A reduction projects the level of each state out: a common factor of its channels moves no element.
+            u, size, vt = _decompose(_without_levels(w, m, self.free))
             back = (vt.T * (size / (size**2 + unknown))) @ u.T
-            m = back @ y
-            if problem.has_free_level(k):
-                # A reduction projects the level of each state out: a common factor of its channels moves no element.
-                u1, size1, vt1 = _decompose(_without_levels(w * moments.counts[:, None], m, problem.channels(k)))
-                back = (vt1.T * (size1 / (size1**2 + unknown))) @ u1.T
-            slopes = -np.einsum("el,klm,mr->ker", back, dw, m, optimize=True)
-            for j in np.flatnonzero(np.any(dc, axis=(1, 2))):
-                slopes[j] += back @ (np.einsum("fl,flr->lr", dc[j], block.z) * scale)
-            bright = float(m[0] @ m[0])
-            slopes -= (slopes[:, 0] @ m[0] / max(bright, 1e-300))[:, None, None] * m
-            for element, of_all in enumerate(np.moveaxis(slopes, 1, 0)):
-                products[element] += acting.spread_products(of_all @ of_all.T)
-            light += bright
-        yield acting.index, products / (max(light, 1e-300) * 15)
+        slopes = -np.einsum("el,klm,mr->ker", back, self.dw, m, optimize=True)
+        for j in np.flatnonzero(np.any(self.dc, axis=(1, 2))):
+            slopes[j] += back @ (np.einsum("fl,flr->lr", self.dc[j], z) * self.scale)
+        bright = float(m[0] @ m[0])
+        slopes -= (slopes[:, 0] @ m[0] / max(bright, 1e-300))[:, None, None] * m
+        return np.array([each @ each.T for each in np.moveaxis(slopes, 1, 0)]), bright
 
 
 def _decompose(w: Array) -> tuple[Array, Array, Array]:
@@ -106,6 +155,7 @@ class MuellerErrors:
     space : candidates that may move M; values (K,), covariance (K, K) : of the posterior.
     products : (16, K, K) of the slopes of each element of M/m00, mean over elements and captures.
     of_captures : of each capture, the values that act on it and products (J, J) of their slopes.
+    of_samples : (S, K, K) products of the slopes for usual samples, mean over elements and captures.
     along : distribution of a sum of the values with weights (K,), in each set of causes; None: it is normal.
     """
 
@@ -114,6 +164,7 @@ class MuellerErrors:
     covariance: Array
     products: Array
     of_captures: tuple[tuple[NDArray[np.int64], Array], ...]
+    of_samples: Array
     along: Along | None = None
 
     @classmethod
@@ -123,24 +174,31 @@ class MuellerErrors:
         space = Space(tuple(posterior.space.candidates[k] for k in chosen))
         index = posterior.space.positions(chosen)
         values, captures = posterior.values[index], len(problem.captures)
+        samples = [sample.reshape(16) / sample[0, 0] for sample in SAMPLES.values()]
         products, each = np.zeros((16, index.size, index.size)), []
-        for acting, part in mueller_slopes(problem, space, values, _residual_rms(problem, solved)):
+        of_samples = np.zeros((len(samples), index.size, index.size))
+        for acting, part, others in mueller_slopes(
+            problem, space, values, _residual_rms(problem, solved), samples=samples
+        ):
             products[:, acting[:, None], acting] += part / captures
+            of_samples[:, acting[:, None], acting] += others / captures
             each.append((acting, part.sum(axis=0)))
         along = partial(_along_some, posterior.along, index, posterior.values.size)
-        return cls(space, values, posterior.covariance[np.ix_(index, index)], products, tuple(each), along)
+        return cls(space, values, posterior.covariance[np.ix_(index, index)], products, tuple(each), of_samples, along)
 
     def corrected_values(self, used: Solution) -> Array:
         """Values (K,) that a correction applies."""
         return self.space.vector(used.space.split(used.fit.values))
 
-    def changes(self, used: Solution) -> tuple[PredictedChange, PredictedChange, tuple[PredictedChange, ...]]:
-        """Change of M by a correction: for these captures, for later ones, and for each of these."""
+    def changes(
+        self, used: Solution
+    ) -> tuple[PredictedChange, tuple[PredictedChange, ...], tuple[PredictedChange, ...]]:
+        """Change of M by a correction: for these captures, for later ones of each sample, and for each of these."""
         correction, products = self.corrected_values(used), self.products.sum(axis=0)
         lasts = np.flatnonzero([c.scope == "instrument" for c in self.space.candidates for _ in c.parameters])
         return (
             self._change(np.arange(correction.size), correction, products),
-            self._change(lasts, correction, products[np.ix_(lasts, lasts)]),
+            tuple(self._change(lasts, correction, p[np.ix_(lasts, lasts)]) for p in (products, *self.of_samples)),
             tuple(self._change(index, correction, part) for index, part in self.of_captures),
         )
 
@@ -268,8 +326,16 @@ def _values_alone(parameters: dict[str, EffectParameter]) -> dict[str, EffectPar
     }
 
 
+def chance_later(later: Sequence[PredictedChange]) -> float:
+    """Chance that the error of M grows in later captures, of samples that the correction changes: a mean over them.
+
+    What a sample does not show of a correction makes nothing worse there, and may in another one.
+    """
+    return float(np.mean([c.chance_worse for c in later if c.is_change] or [0.0]))
+
+
 def chances(
-    now: PredictedChange, later: PredictedChange, lasting: bool, each: Mapping[str, PredictedChange]
+    now: PredictedChange, later: Sequence[PredictedChange], lasting: bool, each: Mapping[str, PredictedChange]
 ) -> tuple[Check, ...]:
     """Error of M as the posterior expects it, and the chance that it grows: an explanation may be too vague to use.
 
@@ -284,7 +350,9 @@ def chances(
     return (
         predicted,
         grows,
-        Check(name=f"{grows.name} in later captures{alone}", before=0.0, after=later.rounded_chance, holds=True),
+        Check(
+            name=f"{grows.name} in later captures{alone}", before=0.0, after=round(chance_later(later), 4), holds=True
+        ),
         *(
             Check(
                 name=f"predicted error of M/m00 of {name}, rms (it grows with a chance of {words[name]})",
@@ -297,11 +365,11 @@ def chances(
     )
 
 
-def lasts(later: PredictedChange, solved: Solution, changed: Collection[int] = ()) -> bool:
+def lasts(later: Sequence[PredictedChange], solved: Solution, changed: Collection[int] = ()) -> bool:
     """Whether what belongs to the instrument may be used for later captures.
 
     Of captures whose sample `changed` it may be a part of that: the others have to bear it out.
     """
     others = [k for k in range(len(solved.after.shares)) if k not in changed]
     gain = sum(solved.before.of(k).excess - solved.after.of(k).excess for k in others)
-    return later.chance_worse <= CHANCE_WORSE and (not changed or gain > 0)
+    return chance_later(later) <= CHANCE_WORSE and (not changed or gain > 0)

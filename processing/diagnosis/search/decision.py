@@ -46,9 +46,14 @@ class PredictedChange:
     share: float | Array = 1.0
 
     @property
+    def is_change(self) -> bool:
+        """Whether the result changes by more than the rounding of counts."""
+        return self.size > LEAST_CHANGE
+
+    @property
     def chance_worse(self) -> float:
         """Chance that the error grows: that the true change goes less than half as far along this one."""
-        if self.size <= LEAST_CHANGE:
+        if not self.is_change:
             return 0.0
         missing = (self.size / 2 - self.expected) / np.maximum(self.stderr, 1e-9 * self.size)
         return float(np.sum(self.share * ndtr(missing)))
