@@ -20,7 +20,7 @@ LEAST_FREEDOM = 0.2
 STEPS = 15
 #: [exchanges] Of many values at once at their bounds that may not help, before one value is exchanged at a time.
 BLOCKS = 3
-#: [chi-square, in the unit of what is left over] The fit ends when a step gains less than this.
+#: [chi-square] The fit ends when a step gains less than this.
 LEAST_GAIN = 0.05
 
 
