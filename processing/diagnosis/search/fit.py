@@ -18,8 +18,6 @@ from processing.diagnosis.search.space import Problem, Space, Sums
 LEAST_FREEDOM = 0.2
 #: [steps] Of a fit.
 STEPS = 15
-#: [exchanges] Of many values at once at their bounds that may not help, before one value is exchanged at a time.
-BLOCKS = 3
 #: [chi-square] The fit ends when a step gains less than this.
 LEAST_GAIN = 0.05
 
@@ -134,7 +132,7 @@ def _bounded_step(g: Array, h: Array, lowest: Array, highest: Array, *, free: Bo
     bound, or let go, until none passes one and none is held back from less (block principal pivoting; Portugal, Judice
     and Vicente, Math. Comput. 63, 625, 1994).
     """
-    step, fewest, tries = np.zeros_like(g), g.size + 1, BLOCKS
+    step, fewest = np.zeros_like(g), g.size + 1
     side = np.where((lowest >= 0) & (g > 0), -1, np.where((highest <= 0) & (g < 0), 1, 0))
     while True:
         moves = free & (side == 0)
@@ -147,10 +145,9 @@ def _bounded_step(g: Array, h: Array, lowest: Array, highest: Array, *, free: Bo
         differ = np.flatnonzero(wanted != side)
         if not differ.size:
             return step
-        # If blocks do not help, one value at a time does in the end.
-        tries = BLOCKS if differ.size < fewest else tries - 1
+        # If a block does not help, one value at a time does in the end.
+        chosen = differ if differ.size < fewest else differ[-1:]
         fewest = min(fewest, differ.size)
-        chosen = differ if tries > 0 else differ[-1:]
         side[chosen] = wanted[chosen]
 
 
