@@ -32,12 +32,12 @@ BOUNDS_SINGULAR = tuple(
 DRAWS_SINGULAR, SPREAD = 1200, 0.1
 
 
-def fall_of(components: float) -> float:
-    """Factor from one variance of an instrument's noise to the next, in 15 directions, for `COMPONENTS` of a block."""
-    target, steps = 1 / (1 / 15 + 16 / 15 * (1 / components - 1 / 8)), np.arange(15)
-    if target > 14.999:
+def fall_of(directions: float, number: int) -> float:
+    """Factor from one of a `number` of variances to the next, whose noise acts in so many directions."""
+    if directions > number - 1e-3:
         return 1.0
-    return float(optimize.brentq(lambda r: np.sum(r**steps) ** 2 / np.sum(r ** (2 * steps)) - target, 1e-3, 1))
+    steps = np.arange(number)
+    return float(optimize.brentq(lambda r: np.sum(r**steps) ** 2 / np.sum(r ** (2 * steps)) - directions, 1e-6, 1))
 
 
 def blocks(components: float, random: np.random.Generator, draws: int = DRAWS, numbers: int = 8) -> np.ndarray:
@@ -46,17 +46,9 @@ def blocks(components: float, random: np.random.Generator, draws: int = DRAWS, n
     Of a block of three singular values the `numbers` are 9.
     """
     directions = np.linalg.qr(random.normal(size=(draws, 15, numbers)))[0]
-    into = np.swapaxes(directions, 1, 2) * fall_of(components) ** (np.arange(15) / 2)
+    fall = fall_of(1 / (1 / 15 + 16 / 15 * (1 / components - 1 / 8)), 15)
+    into = np.swapaxes(directions, 1, 2) * fall ** (np.arange(15) / 2)
     return np.asarray(into / np.sqrt(np.square(into).sum(axis=(1, 2), keepdims=True) / numbers))
-
-
-def fall_of_products(components: float) -> float:
-    """The same from one variance to the next of the three on each side of `products`, for all 9 numbers."""
-    target = 1 / (1 / 9 + 64 / 63 * (1 / components - 1 / 8))
-    if target > 8.999:
-        return 1.0
-    of_side = np.sqrt(target)
-    return float(optimize.brentq(lambda r: (1 + r + r**2) ** 2 / (1 + r**2 + r**4) - of_side, 1e-6, 1))
 
 
 def products(components: float, random: np.random.Generator, draws: int) -> np.ndarray:
@@ -65,7 +57,7 @@ def products(components: float, random: np.random.Generator, draws: int) -> np.n
     Random directions are nearly of rank 2: the mean largest of their singular values is 0.87, that of six of seven
     instruments 0.84 to 0.99.
     """
-    scale = fall_of_products(components) ** (np.arange(3) / 2)
+    scale = fall_of(np.sqrt(1 / (1 / 9 + 64 / 63 * (1 / components - 1 / 8))), 3) ** (np.arange(3) / 2)
     sides = [np.linalg.qr(random.normal(size=(draws, 3, 3)))[0] * scale for _ in range(2)]
     into = np.einsum("dip,djq->dijpq", *sides).reshape(draws, 9, 9)
     into /= np.sqrt(np.square(into).sum(axis=(1, 2), keepdims=True) / 9)
