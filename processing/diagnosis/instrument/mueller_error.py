@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,7 @@ def mueller_slopes(
     """For each capture: the J values that act on it, and products (16, J, J) of the slopes of each element of M/m00.
 
     A common factor of M is left out. Products are means over the 15 elements, and over the pixels by their brightness.
-    The third are products (S, J, J) over all elements, for samples M/m00 (16,) in the place of this one.
+    The last of the three has the products (S, J, J), summed over the elements, of other `samples` M/m00 (16,).
     `rms` (captures,) is what the intensities of each are known to, in units of noise (default: 1). What they do not
     tell of M, within the size of its elements, is not made wrong by an instrument either.
     """
@@ -63,10 +63,14 @@ def mueller_slopes(
 
 @dataclass(frozen=True, eq=False)
 class _SlopesOfPixels:
-    """What J values do to M of pixels in a capture: through rows w (L, 16) of their noise, and counts of scale (L, 1).
+    """What J values do to M of the pixels of a capture.
 
-    `dw` (J, L, 16), `dc` (J, F, L) : slopes of the rows, and of the coefficients c (F, L) of features of the counts.
-    `counts` (L,) : rows that count; `free` : channels that share a level in each state, if they do.
+    Attributes
+    ----------
+    w : (L, 16) rows of the measurement matrix in units of their noise; c : (F, L) coefficients of the features.
+    dw, dc : (J, L, 16), (J, F, L) derivatives of both by the values.
+    scale : (L, 1) one over the noise of each row; counts : (L,) rows that count.
+    free : channels that share a level in each state, if they do.
     """
 
     w: Array
@@ -87,6 +91,10 @@ class _SlopesOfPixels:
         free = problem.channels(k) if problem.has_free_level(k) else None
         return cls(w, c, dw, dc, 1 / moments.sigma[:, None], moments.counts, free)
 
+    @cached_property
+    def _decomposed(self) -> tuple[Array, Array, Array]:
+        return _decompose(self.w * self.counts[:, None])
+
     def joined(self, z: Array) -> Array:
         """Corrected counts (L, R), in units of their noise, of features (F, L, R)."""
         return np.asarray(np.einsum("fl,flr->lr", self.c, z) * self.scale)
@@ -104,8 +112,7 @@ class _SlopesOfPixels:
 
         `noise` : summed square of what they are known to.
         """
-        w = self.w * self.counts[:, None]
-        u, size, vt = _decompose(w)
+        u, size, vt = self._decomposed
         m00 = (vt[:, 0] / size) @ (u.T @ y)
         # The best linear estimate of elements that are as large as m00 at most.
         unknown = noise / max(float(m00 @ m00), 1e-300)
@@ -113,7 +120,7 @@ class _SlopesOfPixels:
         m = back @ y
         if self.free:
             # A reduction projects the level of each state out: a common factor of its channels moves no element.
-            u, size, vt = _decompose(_without_levels(w, m, self.free))
+            u, size, vt = _decompose(_without_levels(self.w * self.counts[:, None], m, self.free))
             back = (vt.T * (size / (size**2 + unknown))) @ u.T
         slopes = -np.einsum("el,klm,mr->ker", back, self.dw, m, optimize=True)
         for j in np.flatnonzero(np.any(self.dc, axis=(1, 2))):

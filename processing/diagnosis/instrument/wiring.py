@@ -57,10 +57,10 @@ def find_miswiring(problem: InstrumentProblem, declared: InstrumentModel | None 
     mistakes = list(_possible(problem, declared))
     wiring = _best(mistakes, [_chi2(w.problem, nothing, none) for w in mistakes], _chi2(problem, nothing, none))
     # Plates that are far off, or another mount, may come nearer to a mistake than to what is declared.
-    return None if wiring is None or _fits_better(problem, wiring.problem) else wiring
+    return None if wiring is None or _needs_no_mistake(problem, wiring.problem) else wiring
 
 
-def _fits_better(problem: InstrumentProblem, rewired: InstrumentProblem) -> bool:
+def _needs_no_mistake(problem: InstrumentProblem, rewired: InstrumentProblem) -> bool:
     """Whether values of the train explain as much as a mistake with others does, and need no more implausible ones.
 
     In air two axes in each other's place do what four far values do. The mistake itself counts as one of them.

@@ -97,8 +97,8 @@ def _descend(
             break
         enough = LEAST_GAIN + RANK * abs(cost)
         while True:
-            # Values that the data hardly tell are those that go too far, where nothing is straight: they are held by
-            # their prior. In units of the curvature, which others give them, they would creep.
+            # A step fails because values that the data hardly determine go too far to be linear. So the damping is in
+            # units of the prior. In units of the curvature such values would move by a thousandth of the way.
             step = _bounded_step(g, h + damping * np.diag(weak), lower - x, upper - x, free=free)
             if not damping and -step @ (2 * g + h @ step) < enough:
                 return Fit(x, sums, float(sums.excess[use].sum()))
@@ -128,9 +128,9 @@ def _with_slopes(problem: Problem, space: Space, fit: Fit) -> Fit:
 def _bounded_step(g: Array, h: Array, lowest: Array, highest: Array, *, free: BoolArray) -> Array:
     """Step (K,) to the minimum of 2 g . s + s . h . s between two bounds (K,); all but the `free` values (K,) stay.
 
-    Beside a value that is cut back at its bound, the others would be where they made up for it. So values are held at a
-    bound, or let go, until none passes one and none is held back from less (block principal pivoting; Portugal, Judice
-    and Vicente, Math. Comput. 63, 625, 1994).
+    If a value were only cut back at its bound, the others would still compensate for the part that was cut off. So
+    values are held at a bound, or released, until none passes a bound and none is held where a release would gain
+    (block principal pivoting; Portugal, Judice and Vicente, Math. Comput. 63, 625, 1994).
     """
     step, fewest = np.zeros_like(g), g.size + 1
     side = np.where((lowest >= 0) & (g > 0), -1, np.where((highest <= 0) & (g < 0), 1, 0))
@@ -145,7 +145,7 @@ def _bounded_step(g: Array, h: Array, lowest: Array, highest: Array, *, free: Bo
         differ = np.flatnonzero(wanted != side)
         if not differ.size:
             return step
-        # If a block does not help, one value at a time does in the end.
+        # An exchange of many may not help; one value at a time ends always.
         chosen = differ if differ.size < fewest else differ[-1:]
         fewest = min(fewest, differ.size)
         side[chosen] = wanted[chosen]
