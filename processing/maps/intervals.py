@@ -309,12 +309,17 @@ def set_retardance(
     )
 
 
-def set_depolarization_power(planes: Planes, is_determined: NDArray[np.bool_]) -> None:
-    """Noise makes three singular values of nothing, and their sum is what the power is short of 1."""
+def set_depolarization_power(planes: Planes, unit: Array, components: float, is_determined: NDArray[np.bool_]) -> None:
+    """Noise makes three singular values of nothing, and their sum is what the power is short of 1.
+
+    Parameters
+    ----------
+    unit : (...), root mean square error of the elements of the depolarizer.
+    components : directions that their noise has, see `sorted_eigenvalues.block_components`.
+    """
     name = "depolarization_power"
-    value = planes[name].astype(float)
-    unit = np.sqrt(3) * planes[f"{name}_errors"].astype(float)
-    total = sum_of_singular_values(3 * (1 - value), unit)
+    value, own = planes[name].astype(float), 3 * planes[f"{name}_errors"].astype(float)
+    total = sum_of_singular_values(3 * (1 - value), unit, own, components)
     chosen = (
         (1 - total.value / 3, value),
         (total.error / 3, np.maximum(value, 1 - value)),

@@ -302,7 +302,7 @@ def _set_intervals(
     least = SEEN * uneven * _relative_error(image)
     is_determined = (passed > 0) & (weakest * passed > least)
     set_retardance(planes, derived, error, linear_error, is_determined=is_determined)
-    set_depolarization_power(planes, passed > least)
+    set_depolarization_power(planes, _noise_of_depolarizer(image, derived), components, passed > least)
     if "differential_retardance_deg" in planes:
         set_differential(planes, is_determined & _is_principal(planes))
     if of_core is not None:
@@ -338,6 +338,21 @@ def _relative_error(image: MuellerImage | ExtrapolatedImage) -> NDArray[np.float
     square = np.square(image.errors.astype(float))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.sqrt((square.sum(axis=(0, 1)) - square[0, 0]) / 15) / image.values[0, 0])
+
+
+def _noise_of_depolarizer(
+    image: MuellerImage | ExtrapolatedImage, derived: Mapping[str, Derived]
+) -> NDArray[np.float64]:
+    """Root mean square error of the nine elements of Lu and Chipman's depolarizer.
+
+    The inverse of a diattenuator D multiplies noise along D by 1 / (1 - D^2), across by the root of that. It adds D
+    times the noise of the polarizance.
+    """
+    square = np.square(image.errors.astype(float) / image.values[0, 0])
+    part = np.square(np.asarray(derived["diattenuation"].value))
+    block, column = square[1:, 1:].mean(axis=(0, 1)), square[1:, 0].mean(axis=0)
+    noise = (block * (1 + 2 * (1 - part)) + column * part) / 3
+    return np.asarray(np.sqrt(noise) / np.abs(1 - part))
 
 
 def _facts(writer: ProductWriter, maps: Mapping[str, Plane]) -> dict[str, Any]:

@@ -186,22 +186,34 @@ def _of_positive() -> list[NDArray[np.float64]]:
     return found
 
 
-def sum_of_singular_values(observed: Array, unit: Array) -> Interval:
-    """Interval of the sum of the singular values of 3 x 3 matrices, taken as alike, as of a depolarizer.
+def sum_of_singular_values(observed: Array, unit: Array, own: Array, components: float) -> Interval:
+    """Interval of the sum of the singular values of 3 x 3 matrices, as of a depolarizer.
+
+    Of noise that is alike in all directions the table has it. Of noise in one direction the sum is a length: in a plane
+    with `own`, and with three times the noise of all elements across, which adds as much to it by second order.
 
     Parameters
     ----------
     observed : (...), sum of those of the noisy matrix.
-    unit : (...), standard error of one element.
+    unit : (...), root mean square error of the elements.
+    own : (...), error of the sum to first order.
+    components : directions that the noise has, see `sorted_eigenvalues.block_components`.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        seen = observed / unit
+        seen, spread = observed / unit, own / unit
         known = np.isfinite(seen) & (seen >= 0)
         low, high, low_95, high_95, end = (np.interp(seen, SUMS, line) for line in _table()[1])
         value = np.where(low > 0, (low + high) / 2, np.minimum(high**2 / end, high) / 2)
-        near = [value, np.maximum(high - value, LEAST), np.maximum(low_95, 0), high_95]
+        by = spread / np.sqrt(3)
+        below = np.where(low_95 > 0, np.maximum(value - by * (value - low_95), 0), 0)
+        near = [value, by * np.maximum(high - value, LEAST), below, value + by * (high_95 - value)]
         # Second order: noise shared by two singular values adds its square over their sum.
-        far, spread = seen - 4.5 / np.maximum(seen, 1.0), np.sqrt(3.0)
-        beyond = [far, np.full_like(far, spread), far - NORMAL_95 * spread, far + NORMAL_95 * spread]
-        pairs = zip(near, beyond, strict=True)
-        return Interval(*(np.where(known, np.where(seen < SUMS[-1], a, b) * unit, np.nan) for a, b in pairs))
+        far = seen - 4.5 / np.maximum(seen, 1.0)
+        beyond = [far, spread, far - NORMAL_95 * spread, far + NORMAL_95 * spread]
+        scale, is_near = np.where(known, unit, np.nan), seen < SUMS[-1]
+        alike = [np.where(is_near, a, b) * scale for a, b in zip(near, beyond, strict=True)]
+        along, across = np.square(own), 9 * np.square(unit)
+        one = interval(observed, along, along + across, along**2 + across**2 / np.minimum(components, 3))
+        share = (8 / components - 1) / 7
+        mixed = Interval(*((1 - share) * a + share * b for a, b in zip(alike, one, strict=True)))
+        return mixed._replace(low=np.where(below > 0, mixed.low, alike[2]))
