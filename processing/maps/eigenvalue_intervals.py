@@ -70,7 +70,9 @@ def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, estimate: CorrectedX
     share = np.interp((4 * estimate.xi0 - 1) / (3 * unit), HEIGHTS, CHOSEN)
     total = np.square(missed) / observed * noise.others * share
     along = np.square(planes["td_missed_errors"].astype(float))
-    put(planes, "td_missed", *interval(missed, along, total, total**2 / components))
+    # Where most of it is along the value, the noise has fewer directions than on average.
+    square = np.fmax(total**2 / components, along**2 + np.square(np.maximum(total - along, 0)) / 7)
+    put(planes, "td_missed", *interval(missed, along, total, square))
     return shrunk
 
 
