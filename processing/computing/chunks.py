@@ -29,9 +29,13 @@ def for_chunks(kernel: Callable[..., object], source: NDArray[Any], *outputs: ND
     if not all(np.shares_memory(f, out) for f, out in zip(flat, outputs, strict=True) if out.size):
         raise ValueError("the leading axes of an output must be contiguous")
 
+    if source.shape[1] <= CHUNK and all(a.dtype == float and a.flags.c_contiguous for a in (source, *outputs)):
+        kernel(source, source.shape[1], *outputs)
+        return
+
     def loop(start: int, stop: int) -> None:
-        chunk = np.zeros((source.shape[0], CHUNK))
-        results = [np.zeros((*out.shape[:-1], CHUNK)) for out in outputs]
+        chunk = np.empty((source.shape[0], CHUNK))
+        results = [np.empty((*out.shape[:-1], CHUNK)) for out in outputs]
         rows = [result.reshape(-1, CHUNK) for result in results]
         for first in range(start, stop, CHUNK):
             count = min(CHUNK, stop - first)

@@ -31,7 +31,7 @@ def for_ranges(items: int, loop: Callable[[int, int], object], align: int = 256,
     Range borders are multiples of `align`; below `smallest` items everything runs in the calling thread.
     The first error of any thread is raised.
     """
-    threads = min(thread_count(), -(-items // smallest)) if items else 0
+    threads = min(thread_count(), -(-items // smallest)) if items > smallest else 1
     if threads <= 1:
         loop(0, items)
         return

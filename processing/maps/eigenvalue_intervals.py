@@ -10,7 +10,6 @@ from processing.arrays import Array, RealArray
 from processing.maps.intervals import Planes, put
 from processing.polarization.eigenvalue_noise import CorrectedXi0, EigenvalueNoise
 from processing.polarization.magnitude import NORMAL_95, interval, positive
-from processing.polarization.quantities import entropy
 from processing.polarization.sorted_eigenvalues import of_gaps, of_singular_values
 from processing.storage.products.images import MuellerImage
 
@@ -93,35 +92,30 @@ def set_entropy(planes: Planes, xi: Array, slopes: RealArray, of_index: RealArra
     shares = np.clip(xi[1:], 0, None)
     sums = shares.sum(axis=0)
     shares = np.where(sums > 0, shares / np.where(sums > 0, sums, 1), 1 / 3)
-    even = 1 + np.square(shares).sum(axis=0)
-
-    def at(of_index: Array) -> Array:
-        # Of the light that is not in the dominant process, of a nearly pure sample, the shares stay.
-        lost = 0.75 * (1 - np.square(np.clip(of_index, 0, 1)))
-        lost = (1 - np.sqrt(np.maximum(1 - even * lost, 0))) / even
-        pure = np.concatenate([1 - lost[None], lost * shares])
-        share = np.clip((lost - PURE[0]) / (PURE[1] - PURE[0]), 0, 1)
-        return entropy_of(pure + share * (0.25 + pattern * np.maximum(of_index, 0) - pure))
-
     by_eigenvalue = -np.log(np.maximum(xi, planes["coherency_eigenvalues_errors"])) / np.log(4)
     slope = np.einsum("k...,k...i->...i", by_eigenvalue, slopes)
-    middle, ends = at(index), []
-    by_index = np.square(np.fmax(*(np.abs(at(index + side * error) - middle) for side in (-1, 1))))
+    points = [index, index - error, index + error]
+    for side, end in ((-1, 1), (1, 0)):
+        units = error, np.abs(bounds[end] - index) / NORMAL_95
+        for level, (far, unit) in enumerate(zip((index - side * error, bounds[end]), units, strict=True)):
+            off_pure = (1 - index) / unit
+            if (off_pure < 4).any():
+                nearest = np.where(off_pure < 4, 1 - positive(off_pure)[level][1 - end] * unit, far)
+                far = np.fmin(nearest, far) if side > 0 else nearest
+            points.append(far)
+    middle, *moved = _entropy_at(np.stack(points), shares, pattern)
+    by_index = np.square(np.fmax(*(np.abs(each - middle) for each in moved[:2])))
     is_cut = index > 1 - error
     if is_cut.any():
         # The curve ends at a pure sample; the covariance with the index does not.
-        moved = image.covariance_with(of_index)
-        shared, variance = (np.einsum("...i,...i->...", moved, each) for each in (slope, of_index))
+        by_element = image.covariance_with(of_index)
+        shared, variance = (np.einsum("...i,...i->...", by_element, each) for each in (slope, of_index))
         by_index = np.where(is_cut, np.fmax(by_index, np.square(shared) / variance), by_index)
     apart = np.sqrt(np.maximum(image.variance_of(slope) - by_index, 0))
-    for side, end in ((-1, 1), (1, 0)):
-        of_95 = np.abs(bounds[end] - index) / NORMAL_95
-        levels = ((1.0, index - side * error, error), (NORMAL_95, bounds[end], of_95))
-        for level, (deviate, far, unit) in enumerate(levels):
-            off_pure = (1 - index) / unit
-            nearest = np.where(off_pure < 4, 1 - positive(off_pure)[level][1 - end] * unit, far)
-            moved = at(np.fmin(nearest, far) if side > 0 else nearest) - middle
-            ends.append(np.clip(middle + side * np.hypot(moved, deviate * apart), 0, 1))
+    ends = [
+        np.clip(middle + side * np.hypot(each - middle, deviate * apart), 0, 1)
+        for (side, deviate), each in zip(((-1, 1), (-1, NORMAL_95), (1, 1), (1, NORMAL_95)), moved[2:], strict=True)
+    ]
     low, low_95, high, high_95 = ends
     # Next to an end of its range the estimate is not the middle of the interval: a truth there has no pull of 1.
     value = np.where((low > 0) & (high < 1), (low + high) / 2, middle)
@@ -132,10 +126,21 @@ def set_entropy(planes: Planes, xi: Array, slopes: RealArray, of_index: RealArra
     put(planes, "entropy", value, *(np.where(without, np.nan, part) for part in (error, low_95, high_95)))
 
 
-def entropy_of(xi: Array) -> Array:
-    """Entropy (...) of eigenvalues (4, ...), without negative ones."""
-    physical = np.clip(xi, 0, None)
-    return np.asarray(entropy(np.moveaxis(physical / physical.sum(axis=0), 0, -1)))
+def _entropy_at(index: Array, shares: Array, pattern: Array) -> Array:
+    """Entropy of depolarization indices (n, ...): of a nearly pure sample the shares (3, ...) of the other light stay.
+
+    `pattern` (4, ...) are the eigenvalues less 1/4 at an index of 1.
+    """
+    even = 1 + np.square(shares).sum(axis=0)
+    lost = 0.75 * (1 - np.square(np.clip(index, 0, 1)))
+    lost = (1 - np.sqrt(np.maximum(1 - even * lost, 0))) / even
+    share, height = np.clip((lost - PURE[0]) / (PURE[1] - PURE[0]), 0, 1), np.maximum(index, 0)
+    total, sum_of_logs = np.zeros(index.shape), np.zeros(index.shape)
+    for pure, off in zip((1 - lost, *(lost * each for each in shares)), pattern, strict=True):
+        xi = np.maximum(pure + share * (0.25 + off * height - pure), 0)
+        total += xi
+        sum_of_logs += xi * np.log(xi + 1e-300)
+    return np.asarray((np.log(total) - sum_of_logs / total) / np.log(4))
 
 
 def set_symmetric(planes: Planes, unit: Array, components: float) -> None:

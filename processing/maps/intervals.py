@@ -343,4 +343,5 @@ def set_differential(planes: Planes, is_determined: NDArray[np.bool_]) -> None:
 def put(planes: Planes, name: str, value: Array, error: Array, *ends: Array) -> None:
     planes[name] = np.asarray(value, dtype=np.float32)
     planes[f"{name}_errors"] = np.asarray(error, dtype=np.float32)
-    planes[f"{name}_95"] = np.stack(ends).astype(np.float32)
+    planes[f"{name}_95"] = both = np.empty((2, *np.shape(value)), np.float32)
+    both[0], both[1] = ends

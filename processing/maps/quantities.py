@@ -328,7 +328,8 @@ def _symmetric_eigenvalues(a: NDArray[np.floating]) -> NDArray[np.float64]:
     deviator = a - mean[..., None, None] * np.eye(3)
     size = np.sqrt(np.einsum("...ij,...ij->...", deviator, deviator) / 6)
     x, y, z = deviator[..., 0, :], deviator[..., 1, :], deviator[..., 2, :]
-    determinant = np.einsum("...i,...i->...", x, np.cross(y, z))
+    a, b, c = (y[..., i] * z[..., j] - y[..., j] * z[..., i] for i, j in ((1, 2), (2, 0), (0, 1)))
+    determinant = x[..., 0] * a + x[..., 1] * b + x[..., 2] * c
     turn = np.arccos(np.clip(np.nan_to_num(determinant / (2 * size**3)), -1, 1)) / 3
     return np.stack([mean + 2 * size * np.cos(turn + 2 * np.pi * k / 3) for k in range(3)])
 

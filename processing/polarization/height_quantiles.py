@@ -12,10 +12,10 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from processing.arrays import Array
 from processing.polarization.cloude import xi0_and_dominant
+from processing.polarization.length_kernels import interpolate
 from processing.polarization.mueller import coherency_to_mueller
 
 #: Probabilities of the quantiles: two-sided 95 and 68 % about the median.
@@ -42,19 +42,22 @@ def true_heights(covariance: NDArray[np.float64], observed: Array, width: Array)
     shape = covariance * (_UNIT / np.trace(covariance))
     table = _inverted(np.ascontiguousarray(shape).tobytes())
     at = np.stack([np.log(width / _LEAST_WIDTH) / np.log(_FACTOR), (observed - _LEAST_X) / _STEP])
-    return np.stack([map_coordinates(level, at, order=1, mode="nearest") for level in table])
+    found = np.empty((len(LEVELS), observed.size))
+    interpolate(table, np.maximum(np.concatenate([0 * at[:1], at]), 0).reshape(3, -1), found)
+    return found.reshape(-1, *observed.shape)
 
 
 @lru_cache(maxsize=8)
 def _inverted(shape: bytes) -> NDArray[np.float64]:
-    """True height (levels, widths, observed) of which the observed one is the quantile of each level."""
+    """True height (1, widths, observed, levels) of which the observed one is the quantile of each level."""
     quantiles = _quantiles(np.frombuffer(shape).reshape(16, 16))
     x = _LEAST_X + _STEP * np.arange(_XS)
     heights = np.concatenate([-THETA[:0:-1], THETA])
     # Below 0 the table is continued as an odd function: an estimate may fall below the ideal depolarizer, and must
     # where its mean is to be right.
     observed = np.maximum.accumulate(np.concatenate([2 * quantiles[0] - quantiles[:0:-1], quantiles]))
-    return np.array([[np.interp(x, one, heights) for one in level] for level in np.moveaxis(observed, 0, -1)])
+    table = np.array([[np.interp(x, one, heights) for one in level] for level in np.moveaxis(observed, 0, -1)])
+    return np.ascontiguousarray(np.moveaxis(table, 0, -1)[None])
 
 
 def _quantiles(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

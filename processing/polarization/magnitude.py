@@ -74,8 +74,9 @@ def interval(
     >>> [bool(low == 0) for low in found.low]
     [True, False]
     """
-    flat = np.stack(np.broadcast_arrays(length, along, total, square, *plane, far)).reshape(8, -1)
-    out = np.empty((4, length.size))
+    flat, out = np.empty((8, length.size)), np.empty((4, length.size))
+    for row, part in zip(flat.reshape(8, *length.shape), (length, along, total, square, *plane, far), strict=True):
+        row[...] = part
     table, nodes = _table()[0], (COMPONENTS, ALONG, OBSERVED)
     for_ranges(length.size, lambda start, stop: lengths(table, nodes, flat, out, start, stop))
     return Interval(*out.reshape(4, *length.shape))
@@ -134,18 +135,29 @@ def directions(vector: Array, covariance: Array, both_ends: bool = False, of_68:
     x, y = np.asarray(vector, dtype=float)
     xx, yy, xy = np.asarray(covariance, dtype=float)
     determinant = np.maximum(xx * yy - xy**2, 0.0)
+    length = x**2 + y**2
     across = np.maximum(x**2 * yy + y**2 * xx - 2 * x * y * xy, 0.0)
-    value, ends = np.arctan2(y, x), []
+    # With the axis of the vector as the first one; both angles are half of what these are the tangents of.
+    turned = 2 * (x * y * (yy - xx) + (x**2 - y**2) * xy) / length
+    sides = []
     for deviate, limit in ((of_68, ANY_DIRECTION[0] * of_68), (NORMAL_95, ANY_DIRECTION[1])):
-        a, d = x**2 - deviate**2 * xx, y**2 - deviate**2 * yy
-        p, q = (a - d) / 2, x * y - deviate**2 * xy
-        half = np.arctan2(deviate * np.sqrt(np.maximum(across - deviate**2 * determinant, 0.0)), (a + d) / 2) / 2
-        off = np.arctan2(q, p) / 2 - value
-        off -= np.pi * np.round(off / np.pi)
+        square = np.square(deviate)
+        p, q = length - square * (xx + yy - 2 * across / length), -square * turned
+        trace, root = length - square * (xx + yy), 2 * deviate * np.sqrt(np.maximum(across - square * determinant, 0.0))
         everything = across <= (deviate if both_ends else limit) ** 2 * determinant
-        whole = np.pi / 2 if both_ends else np.pi
-        ends.append([np.where(everything, side * whole, off + side * half) for side in (-1, 1)])
-    return Directions(np.maximum(-ends[0][0], ends[0][1]), *ends[1])
+        sides.append((p, q, trace, root, everything))
+    whole = np.pi / 2 if both_ends else np.pi
+    (p, q, trace, root, everything), far = sides
+    both = _angle(p * root + np.abs(q) * trace, p * trace - np.abs(q) * root)
+    half = np.where(everything, whole, np.where(both < 0, both + 2 * np.pi, both) / 2)
+    p, q, trace, root, everything = far
+    off, wide = _angle(q, p) / 2, _angle(root, trace) / 2
+    return Directions(half, *(np.where(everything, side * whole, off + side * wide) for side in (-1, 1)))
+
+
+def _angle(y: Array, x: Array) -> Array:
+    """The same as arctan2, in half the time where all are within 90 degrees."""
+    return np.asarray(np.arctan(y / x) if (x > 0).all() else np.arctan2(y, x))
 
 
 #: Grid of `positive`: true and observed values, in standard errors.

@@ -267,7 +267,7 @@ class MuellerImage:
             full = self._covariance.reshape(-1, 256) @ form.reshape(256, 16)
             return np.asarray(np.einsum("pk,pk->p", full, g).reshape(self.mask.shape))
         drive, variance = self._sources
-        each = np.einsum("an,bn,abk->nk", drive, drive, form, optimize=True)
+        each = np.multiply(drive[:, None], drive, dtype=float).reshape(256, -1).T @ form.reshape(256, 16)
         total = np.einsum("np,np->p", each.astype(np.float32) @ g.T.astype(np.float32), variance)
         return np.asarray((total * self.error_ratio).reshape(self.mask.shape))
 
