@@ -75,7 +75,9 @@ def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, estimate: CorrectedX
     return shrunk
 
 
-def set_entropy(planes: Planes, xi: Array, slopes: RealArray, of_index: RealArray, *, image: MuellerImage) -> None:
+def set_entropy(
+    planes: Planes, xi: Array, slopes: RealArray, of_index: RealArray, *, raw: RealArray, image: MuellerImage
+) -> None:
     """Entropy of eigenvalues (4, ...) whose deviations have lost what noise adds. All others are done.
 
     It follows the depolarization index, which has an interval where entropy is bent: near 0 and 1. What noise does at
@@ -84,27 +86,28 @@ def set_entropy(planes: Planes, xi: Array, slopes: RealArray, of_index: RealArra
     Parameters
     ----------
     slopes, of_index : (4, ..., 16) and (..., 16), gradients of the eigenvalues and of the index.
+    raw : (4, ...), eigenvalues that are seen.
     """
     index, error = (planes[f"depolarization_index{end}"].astype(float) for end in ("", "_errors"))
     bounds = planes["depolarization_index_95"].astype(float)
-    off = xi - 0.25
-    pattern = off / np.sqrt(4 / 3 * np.square(off).sum(axis=0))
-    shares = np.clip(xi[1:], 0, None)
-    sums = shares.sum(axis=0)
-    shares = np.where(sums > 0, shares / np.where(sums > 0, sums, 1), 1 / 3)
+    shares, pattern = _pattern_of(xi)
     by_eigenvalue = -np.log(np.maximum(xi, planes["coherency_eigenvalues_errors"])) / np.log(4)
     slope = np.einsum("k...,k...i->...i", by_eigenvalue, slopes)
-    points = [index, index - error, index + error]
+    points, places = [index, index - error, index + error], []
     for side, end in ((-1, 1), (1, 0)):
         units = error, np.abs(bounds[end] - index) / NORMAL_95
-        for level, (far, unit) in enumerate(zip((index - side * error, bounds[end]), units, strict=True)):
+        for level, (far, unit) in enumerate(zip((points[1 + end], bounds[end]), units, strict=True)):
             off_pure = (1 - index) / unit
-            if (off_pure < 4).any():
+            is_near = bool((off_pure < 4).any())
+            if is_near:
                 nearest = np.where(off_pure < 4, 1 - positive(off_pure)[level][1 - end] * unit, far)
                 far = np.fmin(nearest, far) if side > 0 else nearest
-            points.append(far)
-    middle, *moved = _entropy_at(np.stack(points), shares, pattern)
-    by_index = np.square(np.fmax(*(np.abs(each - middle) for each in moved[:2])))
+            if is_near or level:
+                points.append(far)
+            places.append(len(points) - 1 if is_near or level else 1 + end)
+    curve = _entropy_at(np.stack(points), shares, pattern)
+    middle, moved = curve[0], [curve[place] for place in places]
+    by_index = np.square(np.fmax(*(np.abs(each - middle) for each in curve[1:3])))
     is_cut = index > 1 - error
     if is_cut.any():
         # The curve ends at a pure sample; the covariance with the index does not.
@@ -112,9 +115,15 @@ def set_entropy(planes: Planes, xi: Array, slopes: RealArray, of_index: RealArra
         shared, variance = (np.einsum("...i,...i->...", by_element, each) for each in (slope, of_index))
         by_index = np.where(is_cut, np.fmax(by_index, np.square(shared) / variance), by_index)
     apart = np.sqrt(np.maximum(image.variance_of(slope) - by_index, 0))
+    sides = [deviate * apart for deviate in (1, NORMAL_95, 1, NORMAL_95)]
+    # The more the three others differ, the less is the entropy at one index; first order does not show by how much.
+    deviation = raw[1:] - raw[1:].mean(axis=0)
+    deviation *= planes["td_missed_95"][1] / np.abs(deviation).max(axis=0)
+    other = np.concatenate([xi[:1], (1 - xi[:1]) / 3 + deviation])
+    sides[1] = np.fmax(sides[1], moved[1] - _entropy_at(points[places[1]], *_pattern_of(other)))
     ends = [
-        np.clip(middle + side * np.hypot(each - middle, deviate * apart), 0, 1)
-        for (side, deviate), each in zip(((-1, 1), (-1, NORMAL_95), (1, 1), (1, NORMAL_95)), moved[2:], strict=True)
+        np.clip(middle + sign * np.hypot(each - middle, side), 0, 1)
+        for sign, each, side in zip((-1, -1, 1, 1), moved, sides, strict=True)
     ]
     low, low_95, high, high_95 = ends
     # Next to an end of its range the estimate is not the middle of the interval: a truth there has no pull of 1.
@@ -124,6 +133,14 @@ def set_entropy(planes: Planes, xi: Array, slopes: RealArray, of_index: RealArra
     without = np.isnan(image.errors[0, 0])
     low_95, high_95 = (np.where(is_bounded, side, end) for side, end in zip((low_95, high_95), (0.0, 1.0), strict=True))
     put(planes, "entropy", value, *(np.where(without, np.nan, part) for part in (error, low_95, high_95)))
+
+
+def _pattern_of(xi: Array) -> tuple[Array, Array]:
+    """Shares (3, ...) of the light not in the dominant process, and eigenvalues (4, ...) less 1/4 at an index of 1."""
+    off, shares = xi - 0.25, np.clip(xi[1:], 0, None)
+    sums = shares.sum(axis=0)
+    shares = np.where(sums > 0, shares / np.where(sums > 0, sums, 1), 1 / 3)
+    return shares, off / np.sqrt(4 / 3 * np.square(off).sum(axis=0))
 
 
 def _entropy_at(index: Array, shares: Array, pattern: Array) -> Array:
@@ -137,9 +154,13 @@ def _entropy_at(index: Array, shares: Array, pattern: Array) -> Array:
     share, height = np.clip((lost - PURE[0]) / (PURE[1] - PURE[0]), 0, 1), np.maximum(index, 0)
     total, sum_of_logs = np.zeros(index.shape), np.zeros(index.shape)
     for pure, off in zip((1 - lost, *(lost * each for each in shares)), pattern, strict=True):
-        xi = np.maximum(pure + share * (0.25 + off * height - pure), 0)
-        total += xi
-        sum_of_logs += xi * np.log(xi + 1e-300)
+        xi = off * height
+        xi += 0.25 - pure
+        xi *= share
+        xi += pure
+        total += np.maximum(xi, 0, out=xi)
+        xi *= np.log(xi + 1e-300)
+        sum_of_logs += xi
     return np.asarray((np.log(total) - sum_of_logs / total) / np.log(4))
 
 

@@ -309,8 +309,8 @@ def _set_intervals(
         set_symmetric(planes, of_core, components)
     set_ratios(planes, derived, image, m[..., 0, 0])
     if isinstance(image, MuellerImage):
-        gradients_of = (derived[name].gradient for name in ("coherency_eigenvalues", "depolarization_index"))
-        set_entropy(planes, shrunk, *gradients_of, image=image)
+        raw, slopes = derived["coherency_eigenvalues"][:2]
+        set_entropy(planes, shrunk, slopes, derived["depolarization_index"].gradient, raw=raw, image=image)
 
 
 def _is_principal(planes: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
