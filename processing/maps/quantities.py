@@ -296,11 +296,10 @@ def _set_intervals(
     others = {name: derived[name] for name in derived if name not in of_process}
     set_magnitudes(planes, others, m, image, noises={"retardance_deg": retardance})
     set_dominant(planes, derived, m, image.covariance(), seen=seen)
-    weakest = np.abs(_symmetric_eigenvalues(np.nan_to_num(depolarizer[..., 1:, 1:]))).min(axis=0)
     # What is left of the light after the diattenuator carries the noise of all of it.
     passed = 1 - np.square(np.asarray(derived["diattenuation"].value) + diattenuation_error)
     least = SEEN * uneven * _relative_error(image)
-    is_determined = (passed > 0) & (weakest * passed > least)
+    is_determined = (passed > 0) & _exceeds(depolarizer, least / passed)
     set_retardance(planes, derived, error, linear_error, is_determined=is_determined)
     set_depolarization_power(planes, _noise_of_depolarizer(image, derived), components, passed > least)
     if "differential_retardance_deg" in planes:
@@ -319,19 +318,13 @@ def _is_principal(planes: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
     return np.asarray(180 - retardance > SEEN * error)
 
 
-def _symmetric_eigenvalues(a: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Eigenvalues (3, ...) of symmetric matrices (..., 3, 3) from their invariants, far quicker than LAPACK.
-
-    Good to half the digits where two are equal, which is plenty for a limit.
-    """
-    mean = np.trace(a, axis1=-2, axis2=-1) / 3
-    deviator = a - mean[..., None, None] * np.eye(3)
-    size = np.sqrt(np.einsum("...ij,...ij->...", deviator, deviator) / 6)
-    x, y, z = deviator[..., 0, :], deviator[..., 1, :], deviator[..., 2, :]
-    a, b, c = (y[..., i] * z[..., j] - y[..., j] * z[..., i] for i, j in ((1, 2), (2, 0), (0, 1)))
-    determinant = x[..., 0] * a + x[..., 1] * b + x[..., 2] * c
-    turn = np.arccos(np.clip(np.nan_to_num(determinant / (2 * size**3)), -1, 1)) / 3
-    return np.stack([mean + 2 * size * np.cos(turn + 2 * np.pi * k / 3) for k in range(3)])
+def _exceeds(depolarizer: NDArray[np.floating], least: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether all three factors of Lu and Chipman's depolarizer are larger: without these the matrix stays definite."""
+    sign = np.sign(depolarizer[..., 1, 1])
+    x, y, z = (sign * depolarizer[..., k, k] - least for k in (1, 2, 3))
+    a, b, c = (depolarizer[..., i, j] for i, j in ((1, 2), (2, 3), (1, 3)))
+    minor = x * y - a**2
+    return np.asarray((x > 0) & (minor > 0) & (z * minor + 2 * sign * a * b * c > x * b**2 + y * c**2))
 
 
 def _relative_error(image: MuellerImage | ExtrapolatedImage) -> NDArray[np.float64]:
