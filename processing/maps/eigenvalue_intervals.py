@@ -100,7 +100,7 @@ def set_entropy(
             off_pure = (1 - index) / unit
             is_near = bool((off_pure < 4).any())
             if is_near:
-                nearest = np.where(off_pure < 4, 1 - positive(off_pure)[level][1 - end] * unit, far)
+                nearest = np.where(off_pure < 4, 1 - positive(off_pure, level, 1 - end) * unit, far)
                 far = np.fmin(nearest, far) if side > 0 else nearest
             if is_near or level:
                 points.append(far)

@@ -164,21 +164,17 @@ def _angle(y: Array, x: Array) -> Array:
 _TRUE, _SEEN = np.arange(0, 6, 0.05), np.arange(-6, 12, 0.02)
 
 
-def positive(observed: Array) -> tuple[Array, Array]:
-    """Intervals (2, ...) at 68 and 95 % of a number that is not negative, observed with an error of 1, likewise.
+def positive(observed: Array, level: int, end: int) -> Array:
+    """Lower (0) or upper (1) bound at 68 (0) or 95 % of a number that is not negative, observed with an error of 1.
 
     Examples
     --------
     >>> import numpy as np
-    >>> [ends.round(1).tolist() for ends in positive(np.array([-1.0, 5.0]))]
-    [[[0.0, 4.0], [0.3, 6.0]], [[0.0, 3.0], [1.1, 7.0]]]
+    >>> [positive(np.array([-1.0, 5.0]), 0, end).round(1).tolist() for end in (0, 1)]
+    [[0.0, 4.0], [0.3, 6.0]]
     """
-    out = []
-    for (low, high), deviate in zip(_of_positive(), DEVIATES, strict=True):
-        ends = np.interp(observed, high, _TRUE, left=0.0), np.interp(observed, low, _TRUE)
-        far = observed > _TRUE[-1] - 2
-        out.append(np.stack([np.where(far, observed + s * deviate, e) for s, e in zip((-1, 1), ends, strict=True)]))
-    return out[0], out[1]
+    bound = np.interp(observed, _of_positive()[level][1 - end], _TRUE, left=None if end else 0.0)
+    return np.where(observed > _TRUE[-1] - 2, observed + (2 * end - 1) * DEVIATES[level], bound)
 
 
 @cache
