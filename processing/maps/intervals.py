@@ -157,7 +157,7 @@ def set_ratios(planes: Planes, derived: Mapping[str, Derived], image: ElementNoi
         low, high = whole_range(name, middle)
         # Uneven by Fieller: with its larger side 68 % intervals covered up to 85 %.
         ends = over_m00(np.stack([-error[..., some], error[..., some]]), bent, shared, 1.0)
-        half = (ends[1] - ends[0]) / 2
+        half = np.where(np.isfinite(middle), (ends[1] - ends[0]) / 2, error[..., some])
         everything = np.where(np.isfinite(middle), np.maximum(middle - low, high - middle), high - low)
         error[..., some] = np.where(u < 1 / LEAST_M00, half, everything)
         if has_own_95(name):

@@ -242,6 +242,16 @@ def test_entropy_allows_for_a_pattern_that_noise_hides() -> None:
         assert next(c.in_95 for c in table if c.quantity == "entropy") > least
 
 
+def test_an_error_does_not_depend_on_the_other_pixels() -> None:
+    """Where no pixel of a block has a differential decomposition its errors were NaN, and infinite in other blocks."""
+    samples = nineteen_samples()
+    stack = np.repeat(np.stack([samples["retarder 180"], samples["diagonal depolarizer"]]), 60, axis=0)
+    image = noisy_image(stack, 20, 3)
+    together, alone = (quantities_block(each, EXTRA, {}) for each in (image, image.at(np.arange(60))))
+    for name, plane in alone.items():
+        np.testing.assert_allclose(plane[..., 0], together[name][..., 0, :60], rtol=1e-3, atol=1e-4, err_msg=name)
+
+
 def test_over_an_intensity_below_zero_a_length_has_no_interval() -> None:
     # Noise in the dark makes S0 or m00 negative. Whatever the other pixels show, such a pixel shows nothing.
     observed, unit = np.array([-40.0, -3.0, -1e-3, 0.0, 2.0]), np.ones(5)
