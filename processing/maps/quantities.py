@@ -47,7 +47,7 @@ from processing.storage.products.product_writer import ProductWriter
 BLOCK_PIXELS = 1 << 14
 #: Pixels that go through all quantities at a time. Gradients take 128 bytes a pixel and quantity: those of more pixels
 #: leave the cache, and the C library returns them to the system and fetches them anew.
-CACHED_PIXELS = 1 << 11
+CACHED_PIXELS = 1 << 12
 
 #: Decompositions that are computed only where asked for, because they take seconds for a megapixel.
 EXTRA = ("symmetric", "differential")
