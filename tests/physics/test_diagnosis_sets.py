@@ -15,7 +15,7 @@ from processing.diagnosis.search.decision import predicted_change
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import TAU, TAU_WEIGHT
+from processing.diagnosis.search.rules import FAR, TAU, TAU_WEIGHT
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State
 from processing.diagnosis.search.space import Space
 from processing.effect import Effect, Parameter
@@ -153,7 +153,7 @@ def test_a_rare_cause_of_nearly_all_structure_is_found_behind_common_ones_that_e
     gradient = np.append(np.zeros(30), -np.sqrt(14_500 * 1500.0))
     causes = [*groups(*(1 for _ in range(30))), Group(np.array([30]), price=9.0)]
     sets = Sets(Quadratic(18_000.0, gradient, curvature), causes, Noise(True, directions=24.0, slack=400.0))
-    state = State(np.append(np.zeros(30), TAU[-1]))
+    state = State(np.append(np.zeros(30), FAR))
     assert sets.fitted(sets.settled(state)).score > sets.fitted(sets.empty()).score + 2
     assert np.flatnonzero(likely_set(sets).tau).tolist() == [30]
 

@@ -150,7 +150,7 @@ def test_an_index_where_little_is_polarized_has_an_honest_error(scene, configs, 
         data = read_surface(capture, declared.at(NM), scene.object.geometry, fault.material)
     problem = SurfaceProblem(declared.at(NM), [data])
     space = Space(tuple(c for c in problem.pool() if c.kind == "refractive_index"))
-    posterior = fit_posterior(problem, space, (), np.zeros(2), say=lambda line: None)
+    posterior = fit_posterior(problem, space, (), [np.zeros(2)], say=lambda line: None)
     solved = solution(problem, posterior, Space(()), np.zeros(0))
     error = np.sqrt(np.diag(widen_errors(problem, posterior, solved)[1]))
     truth = np.array([fault.parameters["refractive_index"][n] for n in ("n", "k")])

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from bench_capture import bench_capture, read
 
+from processing.computing.blas import one_blas_thread
+from processing.diagnosis.instrument.diagnose import diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.whole_bench import WholeBench
-from processing.diagnosis.instrument.wiring import find_miswiring, find_train_miswiring
+from processing.diagnosis.instrument.wiring import find_train_miswiring, likeliest_arrangement
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from simulators.blind.undeclared_captures import TrueBench
 
@@ -16,6 +18,11 @@ def problem(folder, configs, bench, report_angles, air):
     file = configs / "instruments/rgb950.yaml"
     model, data = read(bench_capture(folder, file, bench, air, seed=4, report_angles=report_angles), file)
     return InstrumentProblem(model, [data])
+
+
+def diagnosed(tried):
+    with one_blas_thread():
+        return diagnose(tried, lambda line: None).diagnosis
 
 
 @pytest.mark.parametrize("air", [True, False])
@@ -34,9 +41,11 @@ def problem(folder, configs, bench, report_angles, air):
 def test_a_mistake_is_told(configs, tmp_path, report_angles, word, air):
     # Beside small faults of the optics, which are no mistake.
     bench = TrueBench(dg=np.deg2rad(128.0), lp=np.deg2rad(-0.2))
-    mistake = find_miswiring(problem(tmp_path, configs, bench, report_angles, air))
-    assert mistake is not None
+    mistake = likeliest_arrangement(problem(tmp_path, configs, bench, report_angles, air))
+    assert mistake.message is not None
     assert word in mistake.message
+    # An unknown sample takes up what tells some of them from a plate that is far off.
+    assert not (air and mistake.is_open), mistake.message
 
 
 @pytest.mark.parametrize("air", [True, False])
@@ -44,7 +53,7 @@ def test_a_mistake_is_told(configs, tmp_path, report_angles, word, air):
 def test_what_is_no_mistake_is_not_called_one(configs, tmp_path, air, degrees):
     bench = TrueBench(og=np.deg2rad(-17.02 + degrees), dg=np.deg2rad(127.12 + degrees))
     bench.level.append(lambda k, a: 1 + 0.02 * np.sin(k))
-    assert find_miswiring(problem(tmp_path, configs, bench, lambda a: a, air)) is None
+    assert likeliest_arrangement(problem(tmp_path, configs, bench, lambda a: a, air)).message is None
 
 
 def test_an_effect_that_has_no_place_behind_exchanged_axes_is_no_error(configs, tmp_path):
@@ -54,7 +63,7 @@ def test_an_effect_that_has_no_place_behind_exchanged_axes_is_no_error(configs, 
     values = {name: EffectParameter(value=0.01, unit="degree") for name in ("cos", "sin")}
     effect = AppliedEffect(kind="unlisted", element=place, parameters=values)
     model = model.model_copy(update={"effects": (effect,)})
-    assert find_miswiring(InstrumentProblem(model, [data])) is None
+    assert likeliest_arrangement(InstrumentProblem(model, [data])).message is None
 
 
 @pytest.mark.parametrize("degrees", [18.0, 22.0])
@@ -62,7 +71,7 @@ def test_a_plate_that_is_far_off_is_no_other_wavelength(configs, tmp_path, degre
     """Its retardance is nearer to the one at 524 nm: that would leave a third of the residual, the plate nothing."""
     bench = TrueBench(da=np.deg2rad(94.78 + degrees))
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
-    assert find_miswiring(problem(tmp_path, configs, bench, lambda a: a, True), declared) is None
+    assert likeliest_arrangement(problem(tmp_path, configs, bench, lambda a: a, True), declared).message is None
 
 
 @pytest.mark.parametrize("air", [True, False])
@@ -70,14 +79,57 @@ def test_the_filter_of_another_wavelength_is_told(configs, tmp_path, air):
     # The plates of this bench have the retardances of 451 nm; the file says 662.
     bench = TrueBench(dg=np.deg2rad(130.01), da=np.deg2rad(143.13))
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
-    mistake = find_miswiring(problem(tmp_path, configs, bench, lambda a: a, air), declared)
+    message = likeliest_arrangement(problem(tmp_path, configs, bench, lambda a: a, air), declared).message
     if not air:
         # Retardances are what an unknown sample absorbs: nothing is told, and nothing wrong.
-        assert mistake is None or "451" in mistake.message
+        assert message is None or "451" in message
         return
-    assert mistake is not None
-    assert "the light is of 451 nm, not of 662" in mistake.message
-    assert "wavelength_nm: 451" in mistake.message
+    assert message is not None
+    assert "the light is of 451 nm, not of 662" in message
+    assert "wavelength_nm: 451" in message
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "degrees"),
+    [
+        ({"oa": 13.41 + 28.0}, "psa_azimuth", 28.0),
+        ({"dg": 127.12 - 47.0, "oa": 13.41 + 4.5}, "psg_retardance", -47.0),
+        ({"lp": -0.53 - 53.0}, "analyzer_azimuth", -53.0),
+    ],
+)
+def test_a_plate_that_is_far_off_is_found_in_air(configs, tmp_path, fault, kind, degrees):
+    bench = TrueBench(**{name: np.deg2rad(value) for name, value in fault.items()})
+    d = diagnosed(problem(tmp_path, configs, bench, lambda a: a, True))
+    assert d.wiring is None
+    assert d.correction.refused is None
+    (found,) = (e.parameters for e in d.effects if e.kind == kind and e.answer == "sure")
+    (value,) = found.values()
+    assert value.value == pytest.approx(degrees, abs=0.1)
+    assert {e.kind for e in d.effects} <= {kind, "psa_azimuth"}
+
+
+def test_what_a_far_plate_does_as_well_is_told_with_the_mistake(configs, tmp_path):
+    """With an unknown sample a generator that turns the other way is a plate at twice its azimuth."""
+    d = diagnosed(problem(tmp_path, configs, TrueBench(), lambda a: a | {"psg": -a["psg"]}, False))
+    assert "'psg' turns the other way" in d.wiring
+    assert "psg_azimuth[psg_retarder] 34" in d.wiring
+    assert d.verdict == "unexplained"
+    assert not [e for e in d.effects if e.answer == "sure"]
+
+
+def test_two_plates_that_are_far_off_together_are_compared_with_a_mistake(configs, tmp_path):
+    """Neither explains much alone. With an unknown sample two reversed axes are plates at twice their azimuths."""
+    bench = TrueBench(og=np.deg2rad(-17.02 + 33.7), oa=np.deg2rad(13.41 - 21.2))
+    message = likeliest_arrangement(problem(tmp_path, configs, bench, lambda a: a, False)).message
+    assert "both axes turn the other way" in message
+    assert "no mistake, but far values" in message
+
+
+def test_a_quarter_turn_in_air_is_one_of_either_retarder(configs, tmp_path):
+    bench = TrueBench(og=np.deg2rad(-17.02 + 90))
+    message = likeliest_arrangement(problem(tmp_path, configs, bench, lambda a: a, True)).message
+    assert "'psg_retarder' is a quarter turn off" in message
+    assert "'psa_retarder' is a quarter turn off" in message
 
 
 @pytest.mark.long

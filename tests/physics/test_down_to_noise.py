@@ -93,7 +93,7 @@ def bench() -> tuple[Space, np.ndarray, np.ndarray, np.ndarray]:
 
 def found(bench: tuple[Space, np.ndarray, np.ndarray, np.ndarray], unlisted: float) -> tuple[set[str], float]:
     space, *acts = bench
-    out = fit_posterior(Bench(*acts, unlisted), space, (), np.zeros(space.size), say=lambda line: None)
+    out = fit_posterior(Bench(*acts, unlisted), space, (), [np.zeros(space.size)], say=lambda line: None)
     return {out.label(g).kind for g in out.free_groups}, out.samples.best.unit
 
 

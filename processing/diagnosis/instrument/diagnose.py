@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +19,8 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
 from processing.diagnosis.instrument.structure import Residual, compute_residual, descriptions
 from processing.diagnosis.instrument.whole_bench import WholeBench, validation_problem
-from processing.diagnosis.instrument.wiring import Wiring, find_miswiring, find_train_miswiring
-from processing.diagnosis.search.causes import Names, causes, observable_effects
+from processing.diagnosis.instrument.wiring import Arrangement, find_train_miswiring, likeliest_arrangement
+from processing.diagnosis.search.causes import OPEN_WIRING, Names, causes, observable_effects
 from processing.diagnosis.search.correction import solution
 from processing.diagnosis.search.decision import Judgement, beyond_chance
 from processing.diagnosis.search.fit import Solution
@@ -47,14 +47,20 @@ def white(r: Residual) -> bool:
     return bool(abs(lag) * np.sqrt(mean.size) < LIMIT)
 
 
-def names_of(problem: InstrumentProblem, posterior: Posterior, solved: Solution, excess: float) -> Names:
-    """Names of the causes of a posterior, as far as the chi-square of structure that is left over allows them."""
+def names_of(
+    problem: InstrumentProblem, posterior: Posterior, solved: Solution, excess: float, *, is_open: bool = False
+) -> Names:
+    """Names of the causes of a posterior, as far as the chi-square of structure that is left over allows them.
+
+    `is_open` : it is not known which wiring they are the answer to.
+    """
     likely = tuple(c for c in causes(posterior, excess) if c.probability >= LIKELY)
     untold = tuple(c for c in likely if c.candidates[0].effect.per_state and not testable(problem, solved, c, likely))
     named = tuple(c for c in likely if c not in untold)
     # What as many values as the data have took away may be any structure.
     excess += sum(2 * c.log_odds * posterior.samples.best.unit for c in untold)
-    return Names(named, doubts(problem, posterior, solved, named, chi2=excess), untold)
+    doubt = dict.fromkeys(named if is_open else (), OPEN_WIRING)
+    return Names(named, doubt | doubts(problem, posterior, solved, named, chi2=excess), untold)
 
 
 @dataclass(frozen=True)
@@ -78,7 +84,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
 
     `declared` is the instrument at all the wavelengths of its file.
     """
-    wiring, bench = _rewire(problem, say, declared)
+    arrangement, bench = _rewire(problem, say, declared)
     problem, posterior = bench.problem, bench.run()
     say("testing what is left over")
     validation, unfit = validation_problem(problem), bench.as_many_as_intensities(posterior, 1 - SURE)
@@ -87,7 +93,9 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     before, after = (tuple(compute_residual(validation, k, *end) for k in captures) for end in solved.ends)
     # Where no test sees any, there is none: of many captures some err by two deviations.
     excess = sum(r.excess for r in after if has_structure(validation, r))
-    names, switched = names_of(validation, posterior, solved, excess), effects_of_switches(validation, solved)
+    is_open = arrangement.is_open and (arrangement.message is not None or bench.is_far(posterior))
+    names = names_of(validation, posterior, solved, excess, is_open=is_open)
+    switched = effects_of_switches(validation, solved)
     errors = MuellerErrors.of(validation, posterior, solved)
     now, later, of_each = errors.changes(solved)
     each = dict(zip((c.name for c in problem.captures), of_each, strict=True)) if len(of_each) > 1 else {}
@@ -103,7 +111,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
         figures=checks(validation, solved),
         # Where there is nothing to apply, nothing is said of what it would do.
         chances=chances(now, later, lasting, each) if solved.effects else (),
-        first=None if wiring is None else wiring.message,
+        first=arrangement.message,
     )
     answer = Answer(validation, posterior, solved, names, judgement, switched)
     final, unseen = answer.applied, unobservable(bench.whole, posterior)
@@ -124,28 +132,27 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
             uncertain=errors.uncertain(problem, final, lasting=lasting) if is_known else None,
         ),
         wiring=judgement.first,
-        branch=bench.branch,
+        branch=bench.branch or (arrangement.branch if is_open else None),
         left_out=not_measured(problem),
         noise=noise_report(problem),
     )
     return Judged(diagnosis, problem, final, before, after if final is solved else before, after)
 
 
-def _rewire(problem: InstrumentProblem, say: Say, declared: InstrumentModel | None) -> tuple[Wiring | None, WholeBench]:
-    """The bench without a mistake of wiring, and which one that was."""
-    wiring = find_miswiring(problem, declared)
-    if wiring is not None:
-        say(wiring.message)
-        problem = wiring.problem
-    bench = WholeBench(problem, say)
+def _rewire(problem: InstrumentProblem, say: Say, declared: InstrumentModel | None) -> tuple[Arrangement, WholeBench]:
+    """How the train is put together, and the bench without a mistake of it."""
+    arrangement = likeliest_arrangement(problem, declared)
+    if arrangement.message is not None:
+        say(arrangement.message)
+    bench = WholeBench(arrangement.problem, say, arrangement.train)
     if not bench.train_is_off:
-        return wiring, bench
+        return arrangement, bench
     say("no values of the train fit: looking for a mistake of wiring")
     wiring = find_train_miswiring(problem, declared)
     if wiring is None:
-        return None, bench
+        return arrangement, bench
     say(wiring.message)
-    return wiring, WholeBench(wiring.problem, say)
+    return replace(arrangement, message=wiring.message), WholeBench(wiring.problem, say)
 
 
 @one_blas_thread()

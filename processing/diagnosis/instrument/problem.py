@@ -80,8 +80,14 @@ class InstrumentProblem:
 
     def nominal(self) -> tuple[Candidate, ...]:
         """Values that the instrument file calls nominal, if a known sample is there to fit them to."""
-        has_sample = any(c.sample is not None for c in self.captures)
-        return nominal_values(self.model, self.captures[0].conditions, self.wavelengths_nm) if has_sample else ()
+        if not self.has_known_sample:
+            return ()
+        return nominal_values(self.model, self.captures[0].conditions, self.wavelengths_nm)
+
+    @property
+    def has_known_sample(self) -> bool:
+        """Whether the sample of a capture is known."""
+        return any(c.sample is not None for c in self.captures)
 
     def levels(self) -> tuple[Candidate, ...]:
         """Levels of the sources that several channels see, where the sample is unknown; else they are projected out."""

@@ -12,12 +12,13 @@ from processing.diagnosis.instrument.initial_values import first_values, nearest
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.photon_noise import exactly_undone
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.train import Train
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.correction import applied
 from processing.diagnosis.search.fit import Fit, minimize, prior, score
 from processing.diagnosis.search.likely_set import everything
 from processing.diagnosis.search.posterior import Posterior, Say, fit_posterior
-from processing.diagnosis.search.rules import EXACT, FAR_OFF, NEEDED, TAKES_PART
+from processing.diagnosis.search.rules import EXACT, FAR, FAR_OFF, NEEDED, TAKES_PART
 from processing.diagnosis.search.space import Space
 from processing.instrument.elements import number
 from processing.instrument.model import InstrumentModel
@@ -39,7 +40,7 @@ class WholeBench:
     start : values by candidate to begin with.
     """
 
-    def __init__(self, problem: InstrumentProblem, say: Say) -> None:
+    def __init__(self, problem: InstrumentProblem, say: Say, train: Train | None = None) -> None:
         self.problem, self.say = problem, say
         self.whole = problem.undivided() if problem.holds_out_states else problem
         self.base = Space((*problem.nominal(), *problem.levels()))
@@ -56,6 +57,8 @@ class WholeBench:
         branch = nearest_branch(self.whole, first_values(self.whole, self.base, self.pool, say))
         self.start, self.branch = branch.values, branch.message
         self._linearize_there()
+        # Where one value of the train is far, each may be.
+        self._far = dict(train.far) if train is not None else {}
 
     def _linearize_there(self) -> None:
         """Take the azimuths found for those of the model: a prior about far ones would widen with their distance."""
@@ -202,7 +205,15 @@ class WholeBench:
         self, candidates: Sequence[Candidate], fixed: Sequence[Candidate], old: Posterior | None = None
     ) -> Posterior:
         space = Space(tuple(candidates))
-        return fit_posterior(self.whole, space, fixed, self._values_at_start(space, old), say=self.say)
+        starts = [self._values_at_start(space, old)]
+        if self._far and old is None:
+            starts.append(space.vector(self.start | self._far))
+        return fit_posterior(self.whole, space, fixed, starts, say=self.say, far=self._far)
+
+    def is_far(self, posterior: Posterior) -> bool:
+        """Whether a value of the train is beyond the plausible."""
+        values = posterior.space.split(posterior.values)
+        return any(np.any(np.abs(values[c]) > FAR * c.typical) for c in self._far)
 
     def _values_at_start(self, space: Space, old: Posterior | None = None) -> Array:
         start = dict(self.start)

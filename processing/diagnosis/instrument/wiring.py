@@ -17,15 +17,15 @@ from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.instrument.initial_values import best_of_starts
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.search.fit import minimize
-from processing.diagnosis.search.rules import LIMIT, NEEDED, TAU
+from processing.diagnosis.instrument.train import MUCH, Train, likeliest_train
+from processing.diagnosis.search.causes import LEAST_DIFFERENCE
+from processing.diagnosis.search.rules import LIMIT, NEEDED, TAKES_PART
 from processing.diagnosis.search.space import Space
 from processing.effect import EffectError
 from processing.instrument.model import InstrumentModel
 
-#: [1] Factor by which less must be left over without a mistake of wiring: no small change of a value does that.
-WIRING = 5.0
-
+#: [log odds] Against one mistake: one bench in twenty has one, and there are twenty.
+MISTAKE = 6.0
 #: [1, fixed] Ratios of two gears that are taken for one another in rotating-retarder polarimeters.
 GEARS = {"5 instead of 4.91": 5 / 4.91, "4.91 instead of 5": 4.91 / 5}
 
@@ -44,35 +44,63 @@ class Wiring:
         return f"{self.mistake}: {self.change}"
 
 
-def find_miswiring(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
-    """The mistake without which far less is left over; None if there is none, or where the train is only nominal.
+@dataclass(frozen=True)
+class Arrangement:
+    """The likeliest way in which the train is put together.
+
+    Attributes
+    ----------
+    message : what to change before anything else, and what it may be instead; None if that is nothing.
+    others : mistakes, and other values of the train, that are not much less likely, in words.
+    problem : the problem without the mistake; train : its likeliest values.
+    """
+
+    message: str | None
+    others: tuple[str, ...]
+    problem: InstrumentProblem
+    train: Train | None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the captures do not tell it from something else."""
+        return bool(self.others)
+
+    @property
+    def branch(self) -> str | None:
+        """What the captures do not tell from it, in a sentence, if it is no mistake."""
+        others = "; or ".join(self.others) if self.message is None else ""
+        return f"what fits as well, or nearly: {others}" if others else None
+
+
+def likeliest_arrangement(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Arrangement:
+    """The likeliest of no mistake and each one that takes most of the residual away, with values of the train.
+
+    A plate that is far off does what a mistake does, and the reverse. So each mistake has its likeliest values.
 
     Parameters
     ----------
     declared : the instrument at all the wavelengths of its file.
     """
     if problem.nominal():
-        return None
+        return Arrangement(None, (), problem, None)
     nothing, none = Space(()), np.zeros(0)
-    mistakes = list(_possible(problem, declared))
-    wiring = _best(mistakes, [_chi2(w.problem, nothing, none) for w in mistakes], _chi2(problem, nothing, none))
-    # Plates that are far off, or another mount, may come nearer to a mistake than to what is declared.
-    return None if wiring is None or _needs_no_mistake(problem, wiring.problem) else wiring
-
-
-def _needs_no_mistake(problem: InstrumentProblem, rewired: InstrumentProblem) -> bool:
-    """Whether values of the train explain as much as a mistake with others does, and need no more implausible ones.
-
-    In air two axes in each other's place do what four far values do. The mistake itself counts as one of them.
-    """
-
-    def fitted(tried: InstrumentProblem) -> tuple[float, int]:
-        space = Space(tuple(c for c in tried.pool() if c.shifts(tried.model)))
-        values = minimize(tried, space, np.zeros(space.size)).values
-        return _chi2(tried, space, values), int(np.sum(np.abs(values) > TAU[-1] * space.joined("typical")))
-
-    (left, far), (left_there, far_there) = fitted(problem), fitted(rewired)
-    return left * WIRING < left_there or (left < WIRING * left_there and far <= far_there + 1)
+    start = _chi2(problem, nothing, none)
+    mistakes = [w for w in _possible(problem, declared) if _chi2(w.problem, nothing, none) < start / MUCH]
+    problems = [problem, *(w.problem for w in mistakes)]
+    trains = [likeliest_train(each, pairs=each is problem) for each in problems]
+    scores = np.array([train.score - MISTAKE * (k > 0) for k, train in enumerate(trains)])
+    order = [int(k) for k in np.argsort(-scores, kind="stable")]
+    best, *close = (k for k in order if scores[k] > scores.max() - LEAST_DIFFERENCE)
+    texts = [f"no mistake, but far values: {trains[0].text}" if trains[0].text else "none of these mistakes"]
+    texts += [w.message for w in mistakes]
+    which = "; or ".join(texts[k] for k in (best, *close))
+    if close:
+        look = "look which is right" if problem.has_known_sample else "look which is right, or take air as well"
+        which = f"the captures do not tell which ({look}): {which}"
+    others = (*(texts[k] for k in close), *(train.text or "no far value" for train in trains[best].rivals))
+    weights = np.exp(scores[[best, *close]] - scores.max())
+    is_mistake = best > 0 or 1 - weights[0] / weights.sum() > TAKES_PART
+    return Arrangement(which if is_mistake else None, others, problems[best], trains[best])
 
 
 def find_train_miswiring(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
@@ -87,7 +115,7 @@ def find_train_miswiring(problem: InstrumentProblem, declared: InstrumentModel |
 
 
 def _best(mistakes: Sequence[Wiring], values: Sequence[float], start: float) -> Wiring | None:
-    fits = [(chi2, k) for k, chi2 in enumerate(values) if chi2 < start / WIRING and start - chi2 > 2 * NEEDED]
+    fits = [(chi2, k) for k, chi2 in enumerate(values) if chi2 < start / MUCH and start - chi2 > 2 * NEEDED]
     return mistakes[min(fits)[1]] if fits else None
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from scipy.linalg import eigh
@@ -14,7 +14,9 @@ from processing.diagnosis.search.sets import Group, Noise, Quadratic
 from processing.diagnosis.search.space import Problem, Space, Sums
 
 
-def group_candidates(space: Space, fixed: Sequence[Candidate]) -> tuple[tuple[tuple[int, ...], ...], list[Group]]:
+def group_candidates(
+    space: Space, fixed: Sequence[Candidate], far: Collection[Candidate] = ()
+) -> tuple[tuple[tuple[int, ...], ...], list[Group]]:
     """Candidates of each group, and the groups: one kind at one place in all captures."""
     by_key: dict[tuple[str, str, int | None], list[int]] = {}
     for k, c in enumerate(space.candidates):
@@ -26,7 +28,8 @@ def group_candidates(space: Space, fixed: Sequence[Candidate]) -> tuple[tuple[tu
         always = space.candidates[group[0]] in fixed
         curve = space.candidates[group[0]].effect.is_response
         price = space.candidates[group[0]].price
-        groups.append(Group(index, float(families.count(family)), NOMINAL_TAU if always else None, curve, price))
+        tau, is_far = NOMINAL_TAU if always else None, any(space.candidates[k] in far for k in group)
+        groups.append(Group(index, float(families.count(family)), tau, curve, price, is_far))
     return tuple(tuple(m) for m in by_key.values()), groups
 
 
@@ -38,8 +41,13 @@ def noise_of(problem: Problem, sums: Sums) -> Noise:
         relative = float(sums.square.sum() / max(sums.count.sum(), 1.0)) * freedom
         chi2 = max(float(sums.excess.sum()) + freedom, 1e-300)
         return Noise(False, freedom, floor=LEAST_NOISE**2 * chi2 / max(relative, 1e-300))
+    return Noise(True, directions_of(problem), SLACK * deviation_of(freedom, problem.spread))
+
+
+def directions_of(problem: Problem) -> float:
+    """Independent directions over which structure spreads: rows left over, for each component of the signal."""
     weighty = sum(free * power.sum() ** 2 / float(np.sum(power**2)) for free, power in problem.powers())
-    return Noise(True, max(weighty, 1.0), SLACK * deviation_of(freedom, problem.spread))
+    return max(float(weighty), 1.0)
 
 
 def deviation_of(freedom: float, spread: float) -> float:

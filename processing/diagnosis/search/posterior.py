@@ -6,7 +6,7 @@ captures are one group; a slip is one of as many rivals as there are states.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,11 +28,11 @@ from processing.diagnosis.search.rules import (
     ALTERNATIVE,
     BENT,
     CHANGES,
+    FAR,
     GROWTH,
     NEEDED,
     ROUNDS,
     SURE,
-    TAU,
 )
 from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Problem, Space
@@ -95,16 +95,25 @@ class Posterior:
         return self.space.candidates[self.members[group][0]]
 
 
-def fit_posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start: Array, *, say: Say) -> Posterior:
+def fit_posterior(
+    problem: Problem,
+    space: Space,
+    fixed: Sequence[Candidate],
+    starts: Sequence[Array],
+    *,
+    say: Say,
+    far: Collection[Candidate] = (),
+) -> Posterior:
     """The posterior of all values of a space.
 
     Parameters
     ----------
     fixed : candidates that are always there (nominal values of the train, switches that are on).
-    start : (K,) values to begin with.
+    starts : values (K,) to begin with, the declared ones first.
+    far : candidates whose values may be beyond the plausible.
     """
-    members, groups = group_candidates(space, fixed)
-    about, sets, state, rivals = _expand(problem, space, fixed, members, groups=groups, start=start)
+    members, groups = group_candidates(space, fixed, far)
+    about, sets, state, rivals = _expand(problem, space, fixed, members, groups=groups, starts=starts)
     samples = stay(sets, likely_starts(sets, state), CHANGES)
     labels = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(labels) or 'nothing'}; unit of chi-square {state.unit:.3g}")
@@ -136,7 +145,7 @@ def _expand(
     members: Sequence[tuple[int, ...]],
     *,
     groups: Sequence[Group],
-    start: Array,
+    starts: Sequence[Array],
 ) -> tuple[Array, Sets, State, dict[int, tuple[int, ...]]]:
     """Values (K,) about which it was linearized, the sets there, the likeliest of them, and what does as well."""
 
@@ -149,12 +158,13 @@ def _expand(
         sets = Sets(form, groups, noise_of(problem, sums))
         return _Round(x, form.at(x / space.joined("typical")), sets, likely_set(sets))
 
-    first = look(start)
-    assert first is not None, "the instrument as declared has no intensities"
+    looks = [trial for trial in map(look, starts) if trial is not None]
+    assert looks, "the instrument as declared has no intensities"
+    first = max(looks, key=lambda trial: trial.score)
     begun: list[_Round | None] = [first]
     if first.state.unit > BENT or not problem.noise_known:
         # Several large causes, none of which explains much alone, or far from linear: from all of them at once as well.
-        begun.append(look(all_at_once(problem, space, fixed, start, noise=first.sets.noise, tau=TAU[-1])))
+        begun.append(look(all_at_once(problem, space, fixed, starts[0], noise=first.sets.noise, tau=FAR)))
         single = [g for g, indices in enumerate(members) if space.candidates[indices[0]].effect.has_bent_valley]
     else:
         # One large cause: many others can explain it together, from which no straight line leads back to it.

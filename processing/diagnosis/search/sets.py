@@ -19,7 +19,7 @@ from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dlauum, dtrtri, dtrtrs
 
 from processing.arrays import Array
-from processing.diagnosis.search.rules import LITTLE, MANY, TAU, TAU_WEIGHT, TAU_WEIGHT_OF_MANY
+from processing.diagnosis.search.rules import LITTLE, MANY, TAU, TAU_WEIGHT, TAU_WEIGHT_OF_FAR, TAU_WEIGHT_OF_MANY
 
 #: [log odds] Of an impossible set, below the evidence of any data.
 NEVER = -1e9
@@ -50,6 +50,7 @@ class Group:
     share : it is one of so many alternatives of which one may be there (states at which an axis slips).
     fixed_tau : it is always there, with this standard deviation; None: it may be absent.
     alone : of all groups that are, one may be there.
+    far : its values were found beyond the plausible, and may be there.
     """
 
     index: NDArray[np.int64]
@@ -57,6 +58,7 @@ class Group:
     fixed_tau: float | None = None
     alone: bool = False
     price: float = 0.0
+    far: bool = False
 
 
 @dataclass(frozen=True)
@@ -153,6 +155,7 @@ class Sets:
         self.taus = TAU
         sizes = np.array([g.index.size for g in groups])
         self.tau_weight = np.where((sizes >= MANY)[:, None], TAU_WEIGHT_OF_MANY, TAU_WEIGHT)
+        self.tau_weight[np.array([g.far for g in groups], dtype=bool)] = TAU_WEIGHT_OF_FAR
         #: Groups of one size, where their values stand (G, n), and the curvature (G, n, n) of each.
         self._alike: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
         for n in np.unique(sizes):
@@ -276,9 +279,8 @@ class Sets:
         weights, now = np.zeros((len(self.groups), self.taus.size)), self.noise.log_likelihood(fit.excess)
         for members, s, q in self._cavities(state, fit, inverse, right):
             value, along = _along_axes(s, q)
-            # Groups of one size have one prior of their variance.
-            prior = self.tau_weight[members[0]]
-            kept = np.flatnonzero(prior)
+            prior = self.tau_weight[members]
+            kept = np.flatnonzero(prior.any(axis=0))
             t2 = (self.taus[kept] ** 2)[:, None]
             scaled = t2 * value
             explained = np.sum(t2 * along / (1 + scaled), axis=2)
@@ -287,7 +289,7 @@ class Sets:
                 excess = fit.excess - state.unit * explained[new]
                 wider = np.log1p(scaled[new] * (state.unit / self.noise.unit(excess))[..., None])
                 gain[new] = self.noise.log_likelihood(excess) - now - 0.5 * np.sum(wider, axis=2)
-            gain += np.log(prior[kept])
+            gain += np.log(np.maximum(prior[:, kept], 1e-300))
             top = gain.max(axis=1, keepdims=True)
             share = np.exp(gain - top)
             total = share.sum(axis=1, keepdims=True)

@@ -61,7 +61,7 @@ class SurfaceJudged:
 def diagnose_surface(problem: SurfaceProblem, material: str, say: Say) -> SurfaceJudged:
     """Find the posterior, test what is left, guard the correction, and name causes."""
     space = Space(problem.pool())
-    posterior = fit_posterior(problem, space, (), np.zeros(space.size), say=say)
+    posterior = fit_posterior(problem, space, (), [np.zeros(space.size)], say=say)
     say("testing what is left over")
     solved, captures = solution(problem, posterior, Space(()), np.zeros(0)), range(len(problem.captures))
     posterior, covariance, wider = widen_errors(problem, posterior, solved)

@@ -23,7 +23,7 @@ class Retardance(RetarderEffect):
 
     belongs_to = "dispersion"
     field = "retardance_deg"
-    fixed_parameters = (Parameter("retardance", "degree", -40, 40, 1.0),)
+    fixed_parameters = (Parameter("retardance", "degree", -90, 90, 1.0),)
 
 
 class Azimuth(RetarderEffect):
@@ -31,4 +31,4 @@ class Azimuth(RetarderEffect):
 
     belongs_to = "mechanics"
     field = "azimuth_deg"
-    fixed_parameters = (Parameter("azimuth", "degree", -45, 45, 1.0),)
+    fixed_parameters = (Parameter("azimuth", "degree", -90, 90, 1.0),)

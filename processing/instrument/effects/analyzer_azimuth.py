@@ -24,7 +24,7 @@ class AnalyzerAzimuth(NominalShift):
 
     belongs_to = "mechanics"
     field = "azimuth_deg"
-    fixed_parameters = (Parameter("azimuth", "degree", -45, 45, 1.0),)
+    fixed_parameters = (Parameter("azimuth", "degree", -90, 90, 1.0),)
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if polarizers(model) and model.mosaic is None else ()
