@@ -14,10 +14,11 @@ from processing.diagnosis.search.correction import needed_groups
 from processing.diagnosis.search.decision import predicted_change
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.likely_set import likely_set
+from processing.diagnosis.search.linearization import quadratic
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import FAR, TAU, TAU_WEIGHT
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State
-from processing.diagnosis.search.space import Space
+from processing.diagnosis.search.space import Space, Sums
 from processing.effect import Effect, Parameter
 from processing.instrument.effects.rotation_slip import RotationSlip
 
@@ -322,3 +323,20 @@ def test_a_correction_has_the_groups_that_it_needs_and_no_more():
     kept = np.arange(30) == 0
     assert needed_groups(quadratic, mean, index, kept=kept, most=1.0).tolist() == [0, 1, 2, 3, 4]
     assert needed_groups(quadratic, mean, index, kept=kept, most=0.0).size == 30
+
+
+def test_a_value_that_shows_nothing_next_to_a_steep_direction_is_kept_out():
+    """An offset beside a slip at a nearly singular W: rounding of 2e15 hides a curvature of -36."""
+    sums = Sums.empty(1, 2)
+    sums.freedom[:], sums.gradient[:] = 1000.0, [[3.0, 1.0]]
+    sums.curvature[0] = np.diag([2e15, 1.0])
+    space = SimpleNamespace(joined=lambda name: np.ones(2))
+    problem = SimpleNamespace(
+        noise_known=True,
+        noise_information=lambda space, x: (np.zeros((2, 2)), np.diag([0.0, 37.0])),
+        time_noise=lambda space, x: np.zeros(2),
+    )
+    form = quadratic(problem, space, np.zeros(2), sums)
+    assert np.diag(form.curvature).min() >= 0
+    state = State(np.ones(2))
+    assert abs(Sets(form, [Group(np.array([k])) for k in range(2)], Noise(True, 10.0)).fitted(state).mean[1]) < 1e-12

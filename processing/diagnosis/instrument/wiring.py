@@ -96,7 +96,7 @@ def likeliest_arrangement(problem: InstrumentProblem, declared: InstrumentModel 
     which = "; or ".join(texts[k] for k in (best, *close))
     if close:
         look = "look which is right" if problem.has_known_sample else "look which is right, or take air as well"
-        which = f"the captures do not tell which ({look}): {which}"
+        which = f"one of these ({look}): {which}"
     others = (*(texts[k] for k in close), *(train.text or "no far value" for train in trains[best].rivals))
     weights = np.exp(scores[[best, *close]] - scores.max())
     is_mistake = best > 0 or 1 - weights[0] / weights.sum() > TAKES_PART

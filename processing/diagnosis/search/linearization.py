@@ -76,6 +76,9 @@ def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic
     g, h = _with_noise_of_counts(g * share, _without_negative(h * np.outer(share, share)), variance)
     excess, g, h = _integrate_out(np.sqrt(problem.time_noise(space, x)) / typical, excess, g, h)
     h = _without_negative(h)
+    # Next to steep directions rounding can hide that a curvature is negative: such a value shows nothing.
+    silent = np.diag(h) < 0
+    g[silent], h[silent], h[:, silent] = 0.0, 0.0, 0.0
     z = x / typical
     total = excess if problem.noise_known else excess + freedom
     return Quadratic(float(total - 2 * g @ z + z @ h @ z), g - h @ z, h)
