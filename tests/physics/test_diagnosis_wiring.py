@@ -114,6 +114,8 @@ def test_what_a_far_plate_does_as_well_is_told_with_the_mistake(configs, tmp_pat
     assert "'psg' turns the other way" in d.wiring
     assert "psg_azimuth[psg_retarder] 34" in d.wiring
     assert d.verdict == "unexplained"
+    # As declared M is wrong by a third, which no error of the bench without the mistake can say.
+    assert d.correction.mueller is None
     assert not [e for e in d.effects if e.answer == "sure"]
 
 

@@ -51,7 +51,8 @@ def show(d: Diagnosis, details: bool = False, written: bool = False) -> None:
     for number, effect in enumerate(d.effects, 1):
         _show_effect(short, number, effect, noise)
     _show_uncertainty(d, written)
-    if d.unexplained is not None:
+    # Without a mistake of wiring the residual may well be noise: then there is nothing to list.
+    if d.unexplained is not None and (d.wiring is None or d.unexplained.description):
         _show_unexplained(short, d.unexplained, d.ranking)
     if details:
         _show_details(short, d)

@@ -115,9 +115,10 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     )
     answer = Answer(validation, posterior, solved, names, judgement, switched)
     final, unseen = answer.applied, unobservable(bench.whole, posterior)
-    # Values that are merely nominal are nowhere near what is true.
+    # With another wiring M is wrong by far more; values that are merely nominal are nowhere near what is true.
     nominal = any(c.place for c in solved.base.candidates)
-    is_known = judgement.refused is None or not nominal or (judgement.first is None and solved.before.rms < FAR_OFF)
+    is_near = judgement.refused is None or not nominal or solved.before.rms < FAR_OFF
+    is_known = judgement.first is None and is_near
     diagnosis = Diagnosis(
         **answer.fields(
             recommended=lambda: recommended(problem, final.space, final.fit, names.rivals, unseen=unseen),
