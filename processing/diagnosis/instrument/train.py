@@ -19,7 +19,7 @@ from processing.diagnosis.search.causes import LEAST_DIFFERENCE
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.linearization import directions_of
 from processing.diagnosis.search.range_of import NEARLY_ZERO
-from processing.diagnosis.search.rules import BENT, FAR, LIMIT, ROUNDS
+from processing.diagnosis.search.rules import BENT, FAR, FAR_OFF, LIMIT, ROUNDS
 from processing.diagnosis.search.space import Space
 
 #: [degree] Between the angles at which a fit may start, for each of those that are far at once.
@@ -81,11 +81,11 @@ def likeliest_train(problem: InstrumentProblem, *, pairs: bool = True) -> Train:
     """
     space = Space(tuple(c for c in problem.pool() if c.shifts(problem.model)))
     directions, start = directions_of(problem), np.zeros(space.size)
-    declared, free = _train_at(problem, space, start, directions), minimize(problem, space, start, expansions=0).values
-    trials = [declared, *(_reweighted(problem, space, x, directions) for x in (start, free))]
+    declared, free = _train_at(problem, space, start, directions), minimize(problem, space, start, expansions=0)
+    trials = [declared, *(_reweighted(problem, space, x, directions) for x in (start, free.values))]
     best = max(trials, key=lambda train: train.score)
     for at_once, is_second in ((1, False), (1, True), (2, False)):
-        if best.is_settled or (at_once == 2 and (not pairs or best.unit < declared.unit / MUCH)):
+        if best.is_settled or (at_once == 2 and (not pairs or best.unit < declared.unit / MUCH or free.rms < FAR_OFF)):
             break
         starts = _far_starts(problem, space, best.far_values if is_second else start, at_once)
         trials += [_reweighted(problem, space, x, directions) for x in (*starts, *best.without_each)]
