@@ -93,18 +93,7 @@ def set_entropy(
     shares, pattern = _pattern_of(xi)
     by_eigenvalue = -np.log(np.maximum(xi, planes["coherency_eigenvalues_errors"])) / np.log(4)
     slope = np.einsum("k...,k...i->...i", by_eigenvalue, slopes)
-    points, places = [index, index - error, index + error], []
-    for side, end in ((-1, 1), (1, 0)):
-        units = error, np.abs(bounds[end] - index) / NORMAL_95
-        for level, (far, unit) in enumerate(zip((points[1 + end], bounds[end]), units, strict=True)):
-            off_pure = (1 - index) / unit
-            is_near = bool((off_pure < 4).any())
-            if is_near:
-                nearest = np.where(off_pure < 4, 1 - positive(off_pure, level, 1 - end) * unit, far)
-                far = np.fmin(nearest, far) if side > 0 else nearest
-            if is_near or level:
-                points.append(far)
-            places.append(len(points) - 1 if is_near or level else 1 + end)
+    points, places = _ends_of_index(index, error, bounds)
     curve = _entropy_at(np.stack(points), shares, pattern)
     middle, moved = curve[0], [curve[place] for place in places]
     by_index = np.square(np.fmax(*(np.abs(each - middle) for each in curve[1:3])))
@@ -133,6 +122,27 @@ def set_entropy(
     without = np.isnan(image.errors[0, 0])
     low_95, high_95 = (np.where(is_bounded, side, end) for side, end in zip((low_95, high_95), (0.0, 1.0), strict=True))
     put(planes, "entropy", value, *(np.where(without, np.nan, part) for part in (error, low_95, high_95)))
+
+
+def _ends_of_index(index: Array, error: Array, bounds: Array) -> tuple[list[Array], list[int]]:
+    """Depolarization indices (...) at which entropy is needed: the index, one error to each side, and other ends.
+
+    Also returns which of them belong to the lower end of entropy at 68 and 95 %, and to the upper one. Next to a pure
+    sample an end is that of a number which is not negative. `bounds` (2, ...) are those of the index at 95 %.
+    """
+    points, places = [index, index - error, index + error], []
+    for side, end in ((-1, 1), (1, 0)):
+        units = error, np.abs(bounds[end] - index) / NORMAL_95
+        for level, (far, unit) in enumerate(zip((points[1 + end], bounds[end]), units, strict=True)):
+            off_pure = (1 - index) / unit
+            is_near = bool((off_pure < 4).any())
+            if is_near:
+                nearest = np.where(off_pure < 4, 1 - positive(off_pure, level, 1 - end) * unit, far)
+                far = np.fmin(nearest, far) if side > 0 else nearest
+            if is_near or level:
+                points.append(far)
+            places.append(len(points) - 1 if is_near or level else 1 + end)
+    return points, places
 
 
 def _pattern_of(xi: Array) -> tuple[Array, Array]:

@@ -52,7 +52,7 @@ def names_of(
 ) -> Names:
     """Names of the causes of a posterior, as far as the chi-square of structure that is left over allows them.
 
-    `is_open` : it is not known which wiring they are the answer to.
+    `is_open` : another wiring, or other values of the train, fit nearly as well.
     """
     likely = tuple(c for c in causes(posterior, excess) if c.probability >= LIKELY)
     untold = tuple(c for c in likely if c.candidates[0].effect.per_state and not testable(problem, solved, c, likely))
@@ -93,6 +93,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     before, after = (tuple(compute_residual(validation, k, *end) for k in captures) for end in solved.ends)
     # Where no test sees any, there is none: of many captures some err by two deviations.
     excess = sum(r.excess for r in after if has_structure(validation, r))
+    # Other values of the train count only if this one is far: its image, say, may explain the capture.
     is_open = arrangement.is_open and (arrangement.message is not None or bench.is_far(posterior))
     names = names_of(validation, posterior, solved, excess, is_open=is_open)
     switched = effects_of_switches(validation, solved)

@@ -18,7 +18,7 @@ from processing.diagnosis.search.correction import applied
 from processing.diagnosis.search.fit import Fit, minimize, prior, score
 from processing.diagnosis.search.likely_set import everything
 from processing.diagnosis.search.posterior import Posterior, Say, fit_posterior
-from processing.diagnosis.search.rules import EXACT, FAR, FAR_OFF, NEEDED, TAKES_PART
+from processing.diagnosis.search.rules import EXACT, FAR_OFF, NEEDED, TAKES_PART
 from processing.diagnosis.search.space import Space
 from processing.instrument.elements import number
 from processing.instrument.model import InstrumentModel
@@ -212,8 +212,8 @@ class WholeBench:
 
     def is_far(self, posterior: Posterior) -> bool:
         """Whether a value of the train is beyond the plausible."""
-        values = posterior.space.split(posterior.values)
-        return any(np.any(np.abs(values[c]) > FAR * c.typical) for c in self._far)
+        train, values = Space(tuple(self._far)), posterior.space.split(posterior.values)
+        return bool(train.is_far(train.vector(values)).any())
 
     def _values_at_start(self, space: Space, old: Posterior | None = None) -> Array:
         start = dict(self.start)

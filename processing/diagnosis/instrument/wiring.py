@@ -7,7 +7,7 @@ element a quarter turn off, angles told in other units, states that are one off,
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -104,19 +104,16 @@ def likeliest_arrangement(problem: InstrumentProblem, declared: InstrumentModel 
 
 
 def find_train_miswiring(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
-    """The same where the train has nominal values, none of which fit: each mistake is judged by the best of them."""
+    """The mistake where the train has nominal values, none of which fit: each is judged by the best of them."""
     base = Space(problem.nominal())
-    mistakes = list(_possible(problem, declared))
 
     def chi2(tried: InstrumentProblem) -> float:
-        return _chi2(tried, base, best_of_starts(tried, base).values)
+        whole = tried.undivided()
+        return _chi2(whole, base, best_of_starts(whole, base).values)
 
-    return _best(mistakes, [chi2(w.problem.undivided()) for w in mistakes], chi2(problem.undivided()))
-
-
-def _best(mistakes: Sequence[Wiring], values: Sequence[float], start: float) -> Wiring | None:
-    fits = [(chi2, k) for k, chi2 in enumerate(values) if chi2 < start / MUCH and start - chi2 > 2 * NEEDED]
-    return mistakes[min(fits)[1]] if fits else None
+    start, mistakes = chi2(problem), [(chi2(w.problem), w) for w in _possible(problem, declared)]
+    found = [each for each in mistakes if each[0] < start / MUCH and start - each[0] > 2 * NEEDED]
+    return min(found, key=lambda each: each[0])[1] if found else None
 
 
 def _chi2(problem: InstrumentProblem, space: Space, values: Array) -> float:

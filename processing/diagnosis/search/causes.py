@@ -26,7 +26,7 @@ LEAST_DIFFERENCE = float(np.log(SURE / (1 - SURE)))
 #: Reasons that leave a name likely.
 PART_OF_LEFT = "it may be a part of what is left unexplained"
 PART_OF_UNLISTED = "it may be a part of the fault that has no name"
-OPEN_WIRING = "it is not known which wiring it goes with"
+OPEN_WIRING = "another wiring, or a far value of the train, fits nearly as well"
 PARTS = (PART_OF_LEFT, PART_OF_UNLISTED, OPEN_WIRING)
 
 Answer = Literal["sure", "likely", "one of", "unlisted", "unknown"]

@@ -10,14 +10,14 @@ import numpy as np
 # ---- prior: what is plausible before the data are seen -------------------------------------------------------------
 #: [typical sizes] Beyond which a value is far: mounts are set to a fraction of a degree far more often.
 FAR = 3.0
-#: [typical sizes] Standard deviations of the values of a group; the last two are those of what was found to be far.
+#: [typical sizes] Standard deviations of the values of a group; the last two only of a train that may be far off.
 TAU = np.array([0.03, 0.055, 0.1, 0.17, 0.3, 0.55, 1.0, 1.7, FAR, 10.0, 30.0])
 #: [probability] How plausible each of these standard deviations is, for a few values: every second is enough.
 TAU_WEIGHT = np.array([0.1, 0.0, 0.2, 0.0, 0.3, 0.0, 0.3, 0.0, 0.1, 0.0, 0.0])
 #: [probability] The same for a value of each state: forty tell theirs so well that with every second two groups of a
 #: third each would do better than the one that is there.
 TAU_WEIGHT_OF_MANY = np.array([0.04, 0.08, 0.1, 0.13, 0.16, 0.16, 0.16, 0.1, 0.07, 0.0, 0.0])
-#: [probability] The same for a value that was found to be far.
+#: [probability] The same for a value of a train that may be far off.
 TAU_WEIGHT_OF_FAR = np.array([0.1, 0.0, 0.2, 0.0, 0.3, 0.0, 0.2, 0.0, 0.1, 0.05, 0.05])
 #: [1] Values from which on a group has many: it can do what several others do.
 MANY = 9

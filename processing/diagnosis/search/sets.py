@@ -50,7 +50,7 @@ class Group:
     share : it is one of so many alternatives of which one may be there (states at which an axis slips).
     fixed_tau : it is always there, with this standard deviation; None: it may be absent.
     alone : of all groups that are, one may be there.
-    far : its values were found beyond the plausible, and may be there.
+    far : its values may be beyond the plausible.
     """
 
     index: NDArray[np.int64]

@@ -12,6 +12,7 @@ from scipy.linalg import block_diag
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.rules import FAR
 from processing.instrument.model import InstrumentModel
 
 
@@ -154,6 +155,10 @@ class Space:
     def positions(self, numbers: Iterable[int]) -> NDArray[np.int64]:
         """Positions (J,) of the values of some candidates, by their numbers, in the common vector."""
         return np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[self.slices[k]] for k in numbers)]).astype(np.int64)
+
+    def is_far(self, values: Array) -> NDArray[np.bool_]:
+        """Whether values (K,) are beyond the plausible."""
+        return np.asarray(np.abs(values) > FAR * self.joined("typical"))
 
     def joined(self, name: str) -> Array:
         """A property of all candidates, end to end."""
