@@ -9,6 +9,7 @@ from processing.diagnosis.instrument.diagnose import diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.instrument.wiring import find_train_miswiring, likeliest_arrangement
+from processing.diagnosis.verdict.report import write_diagnosis_report
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from simulators.blind.undeclared_captures import TrueBench
 
@@ -116,6 +117,10 @@ def test_what_a_far_plate_does_as_well_is_told_with_the_mistake(configs, tmp_pat
     assert d.verdict == "unexplained"
     # As declared M is wrong by a third, which no error of the bench without the mistake can say.
     assert d.correction.mueller is None
+    write_diagnosis_report(tmp_path / "report.html", d, ())
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert 0 < page.find("First of all") < page.find("Recommendation")
+    assert "Structure that no effect explains" not in page
     assert not [e for e in d.effects if e.answer == "sure"]
 
 
