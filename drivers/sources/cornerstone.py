@@ -46,7 +46,7 @@ class Monochromator(PortSource):
         self.config: Config = config
         self._link, self._lines = link, lines
         self._name = f"monochromator on {config.port}"
-        self._model = self._ask("INFO?", _INFO)
+        self._model = agreed(lambda: self._ask("INFO?", _INFO))
         if not re.search(r"cornerstone|oriel|CS\d{3}|\b74\d{3}", self._model, re.IGNORECASE):
             raise WrongDevice(
                 f"identify the {self._name}", f"{self._model!r} is no Cornerstone", "Correct `source` in the rig file"

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from drivers.errors import CommandRejected, DeviceError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.message_device import MessageDevice
-from drivers.serial_link import LineRegistry
+from drivers.serial_link import LineRegistry, agreed
 from drivers.source import PortSource, SourceConfig, check_wavelengths
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -52,7 +52,8 @@ class Dc2200(PortSource):
         self.config: Config = config
         self._device, self._lines = device, lines
         self._name = f"LED driver on {config.port}"
-        maker, self._model, self._serial_number, self._firmware = self._ask("*IDN?", _IDENTITY).split(",")
+        identity = agreed(lambda: self._ask("*IDN?", _IDENTITY))
+        maker, self._model, self._serial_number, self._firmware = identity.split(",")
         if "DC2200" not in self._model.upper():
             raise WrongDevice(
                 f"identify the {self._name}", f"{maker} {self._model} answers", "Correct `source` in the rig file"

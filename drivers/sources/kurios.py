@@ -16,7 +16,7 @@ from pydantic import Field
 
 from drivers.errors import DeviceError, WrongDevice
 from drivers.prompt_line import PromptLine
-from drivers.serial_link import LineRegistry, SerialLink
+from drivers.serial_link import LineRegistry, SerialLink, agreed
 from drivers.shuttered_source import ShutteredConfig, ShutteredSource, open_with_shutter
 from drivers.source import LightSource
 from drivers.sources import sc10
@@ -49,7 +49,8 @@ class TunableFilter(ShutteredSource):
         self._link, self._shutter, self._lines = link, shutter, lines
         self._name = f"tunable filter on {config.port}"
         self._line = PromptLine(link, self._name, config.reply_s, echo=False)
-        self._model = self._line.ask("*idn?")
+        # A late answer to the question of another program has no echo to know it by.
+        self._model = agreed(lambda: self._line.ask("*idn?"))
         if "KURIOS" not in self._model.upper():
             raise WrongDevice(
                 f"identify the {self._name}",

@@ -109,6 +109,17 @@ class SourceConformance:
             served.emulator.faults.clear()
             served.lines.close()
 
+    def test_one_answer_to_another_question_spoils_no_opening(self, served: ServedSource) -> None:
+        """Whoever asked before may have closed the port before its answer came."""
+        description = served.open().describe()
+        commands = served.emulator.faults.commands
+        served.lines.close()
+        for place in range(1, commands + 1):
+            served.emulator.faults.add(Fault("foreign", from_command=place, commands=1))
+            assert served.open().describe() == description
+            served.emulator.faults.clear()
+            served.lines.close()
+
     def test_a_silent_device_is_an_error_in_bounded_time(self, served: ServedSource) -> None:
         source = served.open()
         served.emulator.faults.add(parse_fault("silent"))

@@ -108,7 +108,7 @@ def test_bytes_to_a_cornerstone(echo: bool) -> None:
 
     none = exchange(b"ERROR?", b"0")
     with scripted(
-        exchange(b"INFO?", b"Oriel Instruments, 74100, SN123, 5.02"),
+        *[exchange(b"INFO?", b"Oriel Instruments, 74100, SN123, 5.02")] * 2,
         none,
         exchange(b"GOWAVE 662.000"),
         none,
