@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array, BoolArray
+from processing.diagnosis.search.bounded_step import bounded_step
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.range_of import NEARLY_ZERO, RANK
 from processing.diagnosis.search.rules import LITTLE, NOMINAL_TAU, ROUNDS
@@ -99,7 +100,7 @@ def _descend(
         while True:
             # A step fails because values that the data hardly determine go too far to be linear. So the damping is in
             # units of the prior. In units of the curvature such values would move by a thousandth of the way.
-            step = _bounded_step(g, h + damping * np.diag(weak), lower - x, upper - x, free=free)
+            step = bounded_step(g, h + damping * np.diag(weak), lower - x, upper - x, free=free)
             if not damping and -step @ (2 * g + h @ step) < enough:
                 return Fit(x, sums, float(sums.excess[use].sum()))
             tried = np.clip(x + step, lower, upper)
@@ -123,32 +124,6 @@ def _descend(
 def _with_slopes(problem: Problem, space: Space, fit: Fit) -> Fit:
     """The fit, its sums with derivatives."""
     return fit if fit.sums.gradient.shape[1] == space.size else replace(fit, sums=problem.sums(space, fit.values))
-
-
-def _bounded_step(g: Array, h: Array, lowest: Array, highest: Array, *, free: BoolArray) -> Array:
-    """Step (K,) to the minimum of 2 g . s + s . h . s between two bounds (K,); all but the `free` values (K,) stay.
-
-    If a value were only cut back at its bound, the others would still compensate for the part that was cut off. So
-    values are held at a bound, or released, until none passes a bound and none is held where a release would gain
-    (block principal pivoting; Portugal, Judice and Vicente, Math. Comput. 63, 625, 1994).
-    """
-    step, fewest = np.zeros_like(g), g.size + 1
-    side = np.where((lowest >= 0) & (g > 0), -1, np.where((highest <= 0) & (g < 0), 1, 0))
-    while True:
-        moves = free & (side == 0)
-        step[free] = np.choose(side[free] + 1, [lowest[free], 0.0, highest[free]])
-        rest = g[moves] + h[np.ix_(moves, ~moves)] @ step[~moves]
-        step[moves] = -np.linalg.solve(h[np.ix_(moves, moves)], rest)
-        slope = g + h @ step
-        wanted = np.where(moves, np.where(step < lowest, -1, np.where(step > highest, 1, 0)), side)
-        wanted[free & (side * slope > 0)] = 0
-        differ = np.flatnonzero(wanted != side)
-        if not differ.size:
-            return step
-        # An exchange of many may not help; one value at a time ends always.
-        chosen = differ if differ.size < fewest else differ[-1:]
-        fewest = min(fewest, differ.size)
-        side[chosen] = wanted[chosen]
 
 
 def _penalize(sums: Sums, weak: Array, values: Array, use: Sequence[int], *, reference: float) -> float:
