@@ -11,8 +11,10 @@ from processing.diagnosis.captures.screening import screen_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import compute_residual
-from processing.diagnosis.search.fit import minimize
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.space import Space
+from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from simulators.blind.detector_cases import DETECTOR
@@ -116,3 +118,30 @@ def test_a_bright_rim_of_few_pixels_is_no_offset_of_columns():
     excess = _compare(r + 0.3 * random.standard_normal((states, 1, side)), light, 0.01 * light, 1.0)
     assert excess.columns == pytest.approx(0.09 / 0.5, rel=0.3)
     assert excess.rows == 0
+
+
+def test_a_correlation_of_neighbours_is_as_uncertain_as_bright_pixels_are_few():
+    """And as many of them have no usable neighbour at one of the distances that are compared."""
+    random = np.random.default_rng(6)
+    light = np.where(random.random((1, 36, 36)) < 0.05, 30.0, 0.3) * np.ones((24, 1, 1))
+    light[:, random.random((36, 36)) < 0.5] = np.nan
+    found = [
+        _compare(np.sqrt(light) * random.standard_normal(light.shape), light, 0.01 * light, 1.0) for _ in range(80)
+    ]
+    scatter = max(np.std([f.right for f in found]), np.std([f.down for f in found]))
+    assert np.mean([f.alike_error for f in found]) == pytest.approx(scatter, rel=0.3)
+
+
+def test_a_small_bend_of_the_response_is_no_structure(bench_file, configs):
+    """Corrected counts of a bent response scatter as their slope says."""
+    model = InstrumentModel.load(configs / OPTICS).at(662)
+    with Capture(bench_file(spoiled("nothing", 3, electrons=400.0), air=False)) as capture:
+        data = read_capture(capture, model)
+    problem = InstrumentProblem(model, [data])
+    effect = instrument_effects()["tone_curve"]
+    space = Space((Candidate(effect, "", effect.parameters(model, data.conditions, "")),))
+    tests = []
+    for bend in (0.0, 0.25):
+        values = bend * space.joined("typical")
+        tests.append(compute_residual(problem, 0, space, Fit(values, problem.sums(space, values), 0.0)).tests)
+    assert tests[1]["sum of squares"] == pytest.approx(tests[0]["sum of squares"], abs=1.0)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.special import chdtri, ndtr
 from steady_capture import steady_capture
 
 from processing.diagnosis.captures.unstated_noise import estimated_noise
@@ -9,6 +10,7 @@ from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block, noise_information
 from processing.diagnosis.instrument.structure import Residual, _tests, descriptions
+from processing.diagnosis.search.decision import in_deviations
 from processing.diagnosis.search.linearization import _with_noise_of_counts
 from processing.diagnosis.search.space import Sums
 
@@ -47,6 +49,14 @@ def test_a_shift_or_a_bend_of_noise_promises_nothing(noisy, moved):
     # All of the curvature is noise.
     part = sum(noise_information(block, a, dc, moments))
     assert part == pytest.approx(sums.curvature[0], rel=0.03, abs=0.03 * np.max(part))
+
+
+@pytest.mark.parametrize("directions", [6, 24, 3000])
+@pytest.mark.parametrize("deviate", [-3.0, 2.0, 5.0])
+def test_a_sum_of_squares_is_as_far_off_as_a_normal_variate_that_is_as_unlikely(directions, deviate):
+    square = chdtri(directions, ndtr(-deviate))
+    tests, _ = in_deviations({"x": (square - directions, np.sqrt(2 * directions), directions)})
+    assert tests["x"] == pytest.approx(deviate, abs=0.15)
 
 
 def test_tests_of_pure_noise_scatter_by_one_standard_deviation():

@@ -28,8 +28,8 @@ from processing.diagnosis.search.rules import (
 )
 from processing.storage.captures.capture import CaptureError
 
-#: [pixels] Distance over which noise is no longer alike, and the image has hardly changed; and one more.
-NOT_ALIKE_PX = 3
+#: [pixels] Distances over which noise is no longer alike, and the image has hardly changed.
+FAR_PX = 3, 4
 #: [1] Deviation of the variance of a pixel that is told where neighbours share noise: what a pixel shows of it is not
 #: known better.
 NOISE_OFF_MIXED = 0.15
@@ -90,7 +90,7 @@ def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
     r[:, good] = projector @ white.y
     dark[:, good] = (projector**2 @ floor)[:, None]
     light[:, good] = projector**2 @ white.variance - dark[:, good]
-    scatter = np.sqrt(_half_square(r, light + dark, NOT_ALIKE_PX, 2)) * white.level.mean()
+    scatter = np.sqrt(_half_square(r, light + dark, FAR_PX[0], 2)) * white.level.mean()
     if not scatter > NEARLY_ZERO * float(np.mean(np.abs(data.signal[..., part, :]))):
         raise CaptureError(
             f"{data.name}: its frames have no noise: neighbouring pixels differ by less than numbers are rounded. "
@@ -110,18 +110,14 @@ def _of_a_bend(white: Whitened) -> float:
 
 def _compare(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise:
     expected = light + dark
-    far = (NOT_ALIKE_PX, NOT_ALIKE_PX + 1)
-    across = {lag: _half_square(r, expected, lag, 2) for lag in (1, *far)}
-    down = {lag: _half_square(r, expected, lag, 1) for lag in (1, *far)}
-    count = np.isfinite(r).sum() * free
-    white = float(np.mean([across[lag] for lag in far]))
+    white = float(np.mean([_half_square(r, expected, lag, 2) for lag in FAR_PX]))
     # Bright pixels have most of the variance: what scatters is a sum of as many as they are.
     error = white * float(np.sqrt(3 * np.nansum(expected**2) / free)) / float(np.nansum(expected))
+    (right, right_error), (down, down_error) = (_alike(r, expected, axis) for axis in (2, 1))
     rows, columns = (
-        _common(r / np.sqrt(white), expected, axis, alike=1 - near[1] / white, free=free)
-        for axis, near in ((2, across), (1, down))
+        _common(r / np.sqrt(white), expected, axis, alike=alike / white, free=free)
+        for axis, alike in ((2, right), (1, down))
     )
-    far_down = float(np.mean([down[lag] for lag in far]))
     shot, floor, covariance = _levels(r, light, dark, free)
     return DetectorNoise(
         white=white,
@@ -130,9 +126,9 @@ def _compare(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise:
         dark=floor,
         covariance=covariance,
         light_share=float(np.nansum(light) / np.nansum(expected)),
-        right=1 - across[1] / white,
-        down=1 - (down[1] - white * rows) / max(far_down - white * rows, 1e-12),
-        alike_error=float(np.sqrt(2 / count)),
+        right=right / white,
+        down=down / white,
+        alike_error=max(right_error, down_error) / white,
         bent=1.0,
         rows=rows,
         columns=columns,
@@ -151,6 +147,21 @@ def _half_square(r: Array, expected: Array, lag: int, axis: int) -> float:
     return float(np.nansum((first - second) ** 2) / np.nansum(np.where(np.isfinite(first - second), v1 + v2, 0)))
 
 
+def _alike(r: Array, expected: Array, axis: int) -> tuple[float, float]:
+    """Variance that neighbours over an axis share, over what is expected, and its standard error.
+
+    What pixels further off share is the pattern of a fault. The products of pairs show the error: the rows of one pair
+    go together, and few bright pairs can have most of the weight.
+    """
+    shared, variance = [], []
+    for lag in (1, *FAR_PX):
+        product = np.prod(_pairs(r, lag, axis), axis=0)
+        of_noise = np.where(np.isfinite(product), np.mean(_pairs(expected, lag, axis), axis=0), 0.0)
+        shared.append(float(np.nansum(product) / of_noise.sum()))
+        variance.append(float(np.sum(np.nansum(product, axis=0) ** 2) / of_noise.sum() ** 2))
+    return shared[0] - float(np.mean(shared[1:])), float(np.sqrt(variance[0] + np.mean(variance[1:]) / 2))
+
+
 def _common(r: Array, expected: Array, axis: int, *, alike: float, free: float) -> float:
     """Variance that is common to a line over that of a pixel, from means over an axis; 0 where it may be chance.
 
@@ -160,7 +171,7 @@ def _common(r: Array, expected: Array, axis: int, *, alike: float, free: float) 
     mean, variance = np.nansum(r, axis=axis) / counts, np.nansum(expected, axis=axis) / counts
     variance[variance == 0] = np.nan
     of_mean = variance / counts * (1 + 2 * max(alike, 0.0))
-    (first, second), (v1, v2), (n1, n2) = (_pairs(x, NOT_ALIKE_PX, 1) for x in (mean, variance, of_mean))
+    (first, second), (v1, v2), (n1, n2) = (_pairs(x, FAR_PX[0], 1) for x in (mean, variance, of_mean))
     noise = n1 + n2
     weight = (v1 + v2) / noise**2
     total = np.nansum(weight * (v1 + v2))
@@ -172,10 +183,10 @@ def _common(r: Array, expected: Array, axis: int, *, alike: float, free: float) 
 
 def _levels(r: Array, light: Array, dark: Array, free: float) -> tuple[float, float, Array]:
     """Parts of the variance with and without light over what is declared, and their covariance."""
-    first, second = _pairs(r, NOT_ALIKE_PX, 2)
+    first, second = _pairs(r, FAR_PX[0], 2)
     half = (first - second) ** 2 / 2
     used = np.isfinite(half)
-    design = np.stack([np.mean(_pairs(x, NOT_ALIKE_PX, 2), axis=0)[used] for x in (light, dark)], axis=1)
+    design = np.stack([np.mean(_pairs(x, FAR_PX[0], 2), axis=0)[used] for x in (light, dark)], axis=1)
     factors = np.ones(2)
     for _ in range(3):
         weight = 1 / (design @ np.maximum(factors, LITTLE)) ** 2

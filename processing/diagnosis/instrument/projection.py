@@ -112,6 +112,21 @@ def add_response(counts: NDArray[Any], coefficients: Array, a: Array) -> NDArray
     return result
 
 
+def response_slopes(counts: NDArray[Any], coefficients: Array) -> NDArray[Any] | None:
+    """Slope (L, rows, columns) of corrected counts by the counts, which the noise follows; None where it is one."""
+    plain = coefficients[:-DERIVATIVES]
+    if not np.any(plain[1:]):
+        return None
+    slopes, (x, y) = np.empty_like(counts), places(*counts.shape[1:])
+
+    def strip(rows: slice) -> None:
+        of_features = features(counts[:, rows].astype(float), x[rows], y[rows])[1]
+        slopes[:, rows] = np.einsum("fl,flhw->lhw", plain, of_features)
+
+    for_strips(counts.shape[1], strip)
+    return slopes
+
+
 def add_block(
     block: Block,
     a: Array,

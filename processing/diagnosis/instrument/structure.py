@@ -13,7 +13,7 @@ from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.instrument.features import MARGIN, inside
 from processing.diagnosis.instrument.pixel_sums import Pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.projection import add_response
+from processing.diagnosis.instrument.projection import add_response, response_slopes
 from processing.diagnosis.instrument.tiles import tile_columns
 from processing.diagnosis.search.decision import in_deviations, in_words
 from processing.diagnosis.search.fit import Fit
@@ -68,7 +68,8 @@ def compute_residual(problem: InstrumentProblem, capture: int, space: Space, fit
         usable = usable | data.steep
     used = (usable & ~data.clipped if changes.drop_clipped else usable) & inside(height, width)
     coefficients, whitened = problem.coefficients(capture, changes), problem.columns(capture, changes)
-    y = add_response(data.signal.reshape(rows, height, width), coefficients, whitened)
+    counts = data.signal.reshape(rows, height, width)
+    y, slopes = add_response(counts, coefficients, whitened), response_slopes(counts, coefficients)
     level, pixels = moments.sigma, Pixels(data)
     free = np.zeros((rows, height, width), dtype=np.float32)
     signal = np.zeros((rows, height, width), dtype=np.float32)
@@ -90,6 +91,8 @@ def compute_residual(problem: InstrumentProblem, capture: int, space: Space, fit
     per_scale = np.where(used, 1 / np.where(used, pixels.scale, 1.0), 0.0)
     for row, of_row in enumerate(expected):
         of_row *= pixels.variance_of(row) / level[row] ** 2 * per_scale
+        if slopes is not None:
+            of_row *= slopes[row] ** 2
     good = np.asarray(np.isfinite(r).all(axis=0))
     tests: dict[str, float] = {}
     chi2 = 0.0
@@ -178,8 +181,8 @@ def _tests(
     flat, noise = r[:, good], expected[:, good]
     # Of smooth patterns moved frames keep all the noise, of single pixels only a part.
     freedom = shown @ noise.sum(axis=1, dtype=float)
-    # Name to chi-square beyond noise, and its standard deviation with nothing but noise.
-    tests = {"sum of squares": (_square(flat) - freedom, deviation_of(max(freedom, 1e-300), spread))}
+    # Name to chi-square beyond noise, its standard deviation with nothing but noise, and what noise gives.
+    tests = {"sum of squares": (_square(flat) - freedom, deviation_of(max(freedom, 1e-300), spread), freedom)}
     if count < FEWEST_PIXELS:
         # What goes with the signal, or with the place, needs an image.
         return in_deviations(tests)
@@ -191,15 +194,15 @@ def _tests(
     weights = turned.astype(np.float32) @ s
     linear = flat @ weights.T
     null = (noise @ (weights.T**2)).sum(dtype=float)
-    tests["linear in the signal"] = (_square(linear) - null, np.sqrt(2 * null * spread))
+    tests["linear in the signal"] = (_square(linear) - null, np.sqrt(2 * null * spread), null)
     # Brightness: against the square of the signal, its linear part taken away.
     np.square(s, out=s)
     s -= (s @ weights.T) @ weights
     s /= np.sqrt(np.sum(s**2, axis=1, keepdims=True, dtype=float)).astype(np.float32) + np.float32(1e-30)
     along = np.sum(flat * s, axis=1, dtype=float)
-    expectation = np.sum(noise * s**2, axis=1, dtype=float)
+    expectation = np.sum(noise * s**2, dtype=float)
     # Rows of one pixel go together, since its unknowns are projected out: a sum of squares of all has this deviation.
-    tests["brightness"] = np.sum(along**2) - expectation.sum(), np.sqrt(2 * expectation.sum() * spread + 1e-300)
+    tests["brightness"] = along @ along - expectation, np.sqrt(2 * expectation * spread + 1e-300), expectation
     # Neighbours: noise of two pixels is independent, or as alike as moving the frames has made it.
     for k, name in enumerate(("neighbours, rows", "neighbours, columns")):
         if r.shape[k + 1] > 2:
@@ -211,7 +214,7 @@ def _tests(
                 null = alike[:, k] @ np.sum(expected[first], axis=(1, 2), where=is_pair, dtype=float)
                 # The residuals of the rows of one pixel go together: a pair of pixels counts as one.
                 pairs = product.sum(axis=0, dtype=float)
-                tests[name] = (pairs.sum() - null, np.sqrt(_square(pairs)))
+                tests[name] = (pairs.sum() - null, np.sqrt(_square(pairs)), np.inf)
     # Tiles: mean residual of every row over patches of the image.
     tests["patches"] = _patches(r, expected, spread)
     return in_deviations(tests)
@@ -221,14 +224,14 @@ def _square(x: NDArray[np.floating]) -> float:
     return float(np.sum(x**2, dtype=float))
 
 
-def _patches(r: NDArray[np.float32], expected: NDArray[np.float32], spread: float) -> tuple[float, float]:
+def _patches(r: NDArray[np.float32], expected: NDArray[np.float32], spread: float) -> tuple[float, float, float]:
     side = max(r.shape[1] // TILES, 1)
     h, w = r.shape[1] // side * side, r.shape[2] // side * side
     shape = (r.shape[0], h // side, side, w // side, side)
     total = np.nansum(r[:, :h, :w].reshape(shape), axis=(2, 4), dtype=np.float64)
     null = np.where(np.isfinite(r[:, :h, :w]), expected[:, :h, :w], 0).reshape(shape).sum(axis=(2, 4), dtype=np.float64)
-    pixels = side**2
-    return float((np.sum(total**2) - null.sum()) / pixels), float(np.sqrt(2 * null.sum() / pixels * spread + 1e-300))
+    of_noise = null.sum() / side**2
+    return float(np.sum(total**2) / side**2 - of_noise), float(np.sqrt(2 * of_noise * spread + 1e-300)), float(of_noise)
 
 
 def correlates_of(r: NDArray[np.float32], signal: NDArray[np.float32], good: NDArray[np.bool_]) -> dict[str, float]:

@@ -161,7 +161,21 @@ def in_words(tests: Mapping[str, float]) -> list[str]:
     return [f"{name}: {value:.0f} standard deviations above noise" for name, value in beyond_chance(tests).items()]
 
 
-def in_deviations(tests: dict[str, tuple[float, float]]) -> tuple[dict[str, float], float]:
-    """Tests in standard deviations, of their chi-square beyond noise and its deviation, and the most beyond two."""
-    excess = max(chi2 - 2 * deviation for chi2, deviation in tests.values())
-    return {k: float(chi2 / deviation) for k, (chi2, deviation) in tests.items()}, max(float(excess), 0.0)
+def in_deviations(tests: Mapping[str, tuple[float, float, float]]) -> tuple[dict[str, float], float]:
+    """Tests in standard deviations, and the most chi-square that is beyond two of them.
+
+    Of each the chi-square beyond noise, its deviation, and what noise gives; infinity if it is no sum of squares.
+    """
+    excess = max(chi2 - 2 * deviation for chi2, deviation, _ in tests.values())
+    return {name: _normal_deviate(*test) for name, test in tests.items()}, max(float(excess), 0.0)
+
+
+def _normal_deviate(beyond: float, deviation: float, noise: float) -> float:
+    """Standard deviations by which a normal variate is as unlikely (Wilson and Hilferty, PNAS 17, 684, 1931).
+
+    Of few directions a sum of squares is five deviations off a thousand times as often as a normal variate.
+    """
+    if not 0 < noise < np.inf:
+        return float(beyond / deviation)
+    width = deviation / (3 * noise)
+    return float((np.cbrt(1 + beyond / noise) - 1) / width + width)

@@ -289,7 +289,8 @@ def structure(problem: SurfaceProblem, k: int, space: Space, values: Array) -> t
     """
     pixels, data = problem.pixels(k, space, values), problem.captures[k]
     r, noise = pixels.residual, problem.noise[k] * pixels.free
-    tests = {"sum of squares": (float(np.sum(r**2) - noise.sum()), float(np.sqrt(2 * noise.sum())))}
+    of_noise = float(noise.sum())
+    tests = {"sum of squares": (float(np.sum(r**2) - of_noise), float(np.sqrt(2 * of_noise)), of_noise)}
     basis = range_of(problem.rows(k, space, values) / np.mean(problem.sigma[k], axis=0)[:, None])
     rows, rank = basis.shape
     tiles = np.unique(data.tile)
@@ -302,7 +303,7 @@ def structure(problem: SurfaceProblem, k: int, space: Space, values: Array) -> t
     ):
         if directions > 0:
             # Sums over as many pixels as a tile has count as one.
-            size = len(r) / tiles.size
-            deviation = np.sqrt(2 * directions * np.sum(level**2))
-            tests[name] = float(square - directions * level.sum()) / size, float(deviation) / size
+            size, of_noise = len(r) / tiles.size, float(directions * level.sum())
+            deviation = float(np.sqrt(2 * directions * np.sum(level**2)))
+            tests[name] = float(square - of_noise) / size, deviation / size, of_noise / size
     return in_deviations(tests)
