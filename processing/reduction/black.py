@@ -5,10 +5,12 @@ others, black(t) = offset + dark current x t is fitted to them, pixel by pixel (
 numbers); its error is propagated. With one other exposure only, its mean is taken as it is, and a warning says so.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+from scipy.special import ndtr, ndtri
 
 from processing.arrays import Array
 from processing.instrument.changes import MAD_TO_SIGMA
@@ -19,6 +21,8 @@ from processing.storage.captures.capture import Capture
 SAME_EXPOSURE = 1e-3
 #: A dark current below half a count over the exposures concerned hides in the rounding.
 UNSEEN_COUNTS = 0.5
+#: Share of counts of zero among the darks from which on they are taken as cut off.
+MOST_CUT_OFF = 0.01
 #: Excess of the darks' noise over the noise model that is believed, in standard errors.
 BELIEVED = 3.0
 
@@ -34,6 +38,7 @@ class Black:
     exposure_s : (D,) ascending; NaN where exposures are not known.
     states, frames : (D,) dark states and frames (states times repeats) of each exposure; 0 for a declared level.
     scatter : (D,) variance of the dark states about their mean, counts^2, and its standard error; NaN for one state.
+    zero_share : (D,) share of their counts that are cut off at zero, for which `means` are corrected.
     """
 
     means: NDArray[np.float32]
@@ -42,6 +47,7 @@ class Black:
     frames: Array
     scatter: Array
     scatter_stderr: Array
+    zero_share: Array = field(default_factory=lambda: np.zeros(1))
 
     @classmethod
     def level(cls, counts: float) -> "Black":
@@ -60,10 +66,10 @@ class Black:
         means, groups = [], []
         for group in _groups(exposure):
             mean, scatter, stderr = _mean_of(capture, dark[group])
-            means.append(mean)
-            groups.append([exposure[group].mean(), len(group), repeats[group].sum(), scatter, stderr])
-        exposure_s, states, frames, scatter, stderr = np.array(groups, dtype=float).T
-        return cls(np.stack(means), exposure_s, states, frames, scatter, stderr)
+            share = _zero_share(capture, dark[group])
+            means.append(mean - np.float32(_cut_off(float(np.nanmean(mean)), share)))
+            groups.append([exposure[group].mean(), len(group), repeats[group].sum(), scatter, stderr, share])
+        return cls(np.stack(means), *np.array(groups, dtype=float).T)
 
     @property
     def measured(self) -> bool:
@@ -155,7 +161,14 @@ class Black:
         return f"{matched_text}; at {_seconds(light[~matched])}: {line}"
 
     def warnings(self, exposure_s: ArrayLike) -> list[str]:
-        """Warnings about exposures (N,) without their own darks."""
+        """Warnings about exposures (N,) without their own darks, and about darks that are cut off at zero."""
+        return self._without_own_darks(exposure_s) + [
+            f"{share:.0%} of the counts of the dark states are cut off at zero. What that adds to their mean was taken "
+            "off, as for normal noise. Raise the black level of the camera."
+            for share in self.zero_share[self.zero_share > MOST_CUT_OFF]
+        ]
+
+    def _without_own_darks(self, exposure_s: ArrayLike) -> list[str]:
         light = np.unique(np.asarray(exposure_s, dtype=float))
         unmatched = light[~self.matches(light)]
         if not self.measured or unmatched.size == 0:
@@ -209,6 +222,31 @@ def _mean_of(capture: Capture, states: NDArray[np.int64]) -> tuple[NDArray[np.fl
         each.append((sums[2] - sums[1] ** 2 / sums[0]) / sums[0] if sums[0] else float("nan"))
     scatter = float(np.mean(each)) * n / (n - 1)
     return mean.astype(np.float32), scatter, scatter * float(np.sqrt(2 / ((n - 1) * mean.size)))
+
+
+def _zero_share(capture: Capture, states: NDArray[np.int64]) -> float:
+    """Share of the counts of some states that are zero; 0 where counts are means."""
+    if not capture.integer_counts:
+        return 0.0
+    return float(np.mean([np.mean(capture.frames(int(k), rows) <= 0) for k in states for rows in capture.row_blocks()]))
+
+
+def _cut_off(mean: float, zero_share: float) -> float:
+    """Counts by which a mean of normal noise is too high, as its values below one half are counts of zero.
+
+    The share of zeros and the mean give both numbers of the normal distribution. Of counts of zero and one alone they
+    do not, and the mean is taken as it is.
+    """
+    rest = 1 - zero_share
+    if zero_share <= MOST_CUT_OFF or mean < (1 + MOST_CUT_OFF) * rest:
+        return 0.0
+    deviate, counts = -ndtri(zero_share), np.arange(1 + int(mean / rest) * 50)
+
+    def excess(log_width: float) -> float:
+        # The mean of counts is the sum of the probabilities of more than 0, 1, 2, ...
+        return float(ndtr(deviate - counts / np.exp(log_width)).sum() - mean)
+
+    return mean - (0.5 + float(deviate) * float(np.exp(brentq(excess, np.log(0.1), np.log(10 * mean / rest)))))
 
 
 def _neighbour_variance(images: NDArray[np.float32]) -> Array:

@@ -59,6 +59,23 @@ def test_what_is_told_of_the_darks(synthetic_capture, exposure_s, rate, warning)
     assert (warning in warnings) if warning else not warnings
 
 
+@pytest.mark.parametrize(
+    ("level", "noise", "stderr", "told"),
+    [(4.0, 4.3, 0.029, True), (0.0, 2.0, 0.019, True), (-0.5, 0.8, 0.026, True), (20.0, 3.0, 0.019, False)],
+)
+def test_darks_that_are_cut_off_at_zero_have_the_black_of_their_noise(
+    synthetic_capture, level, noise, stderr, told
+) -> None:
+    """Their mean alone is too high by 0.4, 0.8 and 0.6 counts."""
+    random = np.random.default_rng(1)
+    frames = np.full((6, 1, 100, 120), 200, dtype=np.uint16)
+    frames[:2] = np.clip(np.round(random.normal(level, noise, (2, 1, 100, 120))), 0, None)
+    with Capture(synthetic_capture(frames, ANGLES, role=ROLE)) as capture:
+        correction = CountCorrection.of(capture)
+        assert correction.black.at(np.nan).mean() == pytest.approx(level, abs=3 * stderr)
+    assert any("cut off at zero" in text for text in correction.warnings) is told
+
+
 def test_line_through_other_exposures_and_its_error() -> None:
     """Many draws of noisy darks at two exposures: bias and variance of the black between them."""
     rng = np.random.default_rng(1)
