@@ -78,7 +78,9 @@ def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
     part = slice((height - rows) // 2, (height - rows) // 2 + rows)
     looked_at = np.zeros(data.usable.shape, dtype=bool)
     looked_at[part] = (data.usable & ~data.clipped)[part]
-    if looked_at.sum() < FEWEST_OF_MANY:
+    # Bright pixels have most of the noise, and count as the number of equal ones that scatters as much.
+    weight = data.variance(looked_at).sum(axis=(0, 1), dtype=float)
+    if weight.sum() ** 2 < FEWEST_OF_MANY * np.sum(weight**2):
         return None
     white = Whitened.of(data, a, looked_at)
     if white.outside.shape[1] < FEWEST_FREE:
