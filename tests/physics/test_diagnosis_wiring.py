@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from bench_capture import bench_capture, read
+from emulated_instruments import BENCHES, INSTRUMENTS, SAMPLE, emulated_capture
 
 from processing.computing.blas import one_blas_thread
-from processing.diagnosis.instrument.diagnose import diagnose
+from processing.diagnosis.instrument.diagnose import diagnose, diagnose_captures
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.instrument.wiring import find_train_miswiring, likeliest_arrangement
@@ -55,6 +56,17 @@ def test_what_is_no_mistake_is_not_called_one(configs, tmp_path, air, degrees):
     bench = TrueBench(og=np.deg2rad(-17.02 + degrees), dg=np.deg2rad(127.12 + degrees))
     bench.level.append(lambda k, a: 1 + 0.02 * np.sin(k))
     assert likeliest_arrangement(problem(tmp_path, configs, bench, lambda a: a, air)).message is None
+
+
+def test_a_table_of_an_unknown_sample_is_no_mistake(tmp_path):
+    """Parts of 12 states with 16 unknowns each fit any mistake that mixes their rows."""
+    file, bench = tmp_path / "drr_5to1.yaml", BENCHES["drr_5to1"]
+    file.write_text((INSTRUMENTS / file.name).read_text())
+    model = InstrumentModel.load(file)
+    random = np.random.default_rng(1)
+    path = emulated_capture(model.at(bench.nm), bench, SAMPLE, "unknown", file=file, random=random)
+    diagnosis = diagnose_captures([path], model)[0].diagnosis
+    assert (diagnosis.wiring, diagnosis.verdict) == (None, "consistent")
 
 
 def test_an_effect_that_has_no_place_behind_exchanged_axes_is_no_error(configs, tmp_path):

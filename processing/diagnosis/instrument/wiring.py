@@ -83,11 +83,15 @@ def likeliest_arrangement(problem: InstrumentProblem, declared: InstrumentModel 
     """
     if problem.nominal():
         return Arrangement(None, (), problem, None)
+    # Parts of the states, each with a sample of its own, may have as many unknowns as intensities.
+    whole = problem.undivided() if problem.holds_out_states else problem
     nothing, none = Space(()), np.zeros(0)
-    start = _chi2(problem, nothing, none)
-    mistakes = [w for w in _possible(problem, declared) if _chi2(w.problem, nothing, none) < start / MUCH]
-    problems = [problem, *(w.problem for w in mistakes)]
-    trains = [likeliest_train(each, pairs=each is problem) for each in problems]
+    start, possible = _chi2(whole, nothing, none), zip(*(_possible(p, declared) for p in (problem, whole)), strict=True)
+    believed = [
+        (w, undivided.problem) for w, undivided in possible if _chi2(undivided.problem, nothing, none) < start / MUCH
+    ]
+    mistakes, problems = [w for w, _ in believed], [problem, *(w.problem for w, _ in believed)]
+    trains = [likeliest_train(each, pairs=each is whole) for each in (whole, *(each for _, each in believed))]
     scores = np.array([train.score - MISTAKE * (k > 0) for k, train in enumerate(trains)])
     order = [int(k) for k in np.argsort(-scores, kind="stable")]
     best, *close = (k for k in order if scores[k] > scores.max() - LEAST_DIFFERENCE)
