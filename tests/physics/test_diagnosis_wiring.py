@@ -152,6 +152,21 @@ def test_a_quarter_turn_in_air_is_one_of_either_retarder(configs, tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.long
+def test_axes_of_a_nominal_train_in_air_turn_against_each_other(tmp_path):
+    """Which of both turns the other way, the azimuths of all plates hide."""
+    file, bench = tmp_path / "drr_single_detector.yaml", BENCHES["drr_single_detector"]
+    file.write_text((INSTRUMENTS / file.name).read_text())
+    model, states = InstrumentModel.load(file), len(bench.angles_deg["psa"])
+    as_they_were = bench.angles_deg | {"psa": -bench.angles_deg["psa"]}, np.ones(states)
+    random = np.random.default_rng(5)
+    path = emulated_capture(model.at(bench.nm), bench, np.eye(4), "air", file=file, random=random, wrong=as_they_were)
+    wiring = diagnose_captures([path], model)[0].diagnosis.wiring
+    assert wiring is not None
+    assert wiring.startswith("one of these (look which is right)")
+    assert all(f"axis {axis!r} turns the other way" in wiring for axis in ("psg", "psa"))
+
+
 def test_a_mistake_is_told_where_the_train_has_nominal_values(configs, tmp_path):
     """Azimuths and retardances that `calibrate` leaves open do not mend an axis that turns the other way."""
     bench = TrueBench(rows=9, columns=9, og=np.deg2rad(-3.0), dg=np.deg2rad(120.0), oa=np.deg2rad(30.0))
@@ -160,9 +175,9 @@ def test_a_mistake_is_told_where_the_train_has_nominal_values(configs, tmp_path)
     mirrored.models = tuple(m.model_copy(update={"calibrate": nominal}) for m in mirrored.models)
     mirrored.model = mirrored.models[0]
     assert WholeBench(mirrored, lambda line: None).train_is_off
-    mistake = find_train_miswiring(mirrored)
-    assert mistake is not None
-    assert "'psa' turns the other way" in mistake.message
+    found = find_train_miswiring(mirrored)
+    assert found is not None
+    assert "'psa' turns the other way" in found[0]
     straight = problem(tmp_path / "straight", configs, bench, lambda a: a, air=True)
     straight.models, straight.model = mirrored.models, mirrored.model
     assert not WholeBench(straight, lambda line: None).train_is_off

@@ -153,8 +153,9 @@ def _rewire(problem: InstrumentProblem, say: Say, declared: InstrumentModel | No
     wiring = find_train_miswiring(problem, declared)
     if wiring is None:
         return arrangement, bench
-    say(wiring.message)
-    return replace(arrangement, message=wiring.message), WholeBench(wiring.problem, say)
+    message, rewired = wiring
+    say(message)
+    return replace(arrangement, message=message), WholeBench(rewired, say)
 
 
 @one_blas_thread()

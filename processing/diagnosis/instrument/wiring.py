@@ -7,7 +7,7 @@ element a quarter turn off, angles told in other units, states that are one off,
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +19,7 @@ from processing.diagnosis.instrument.initial_values import best_of_starts
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.train import MUCH, Train, likeliest_train
 from processing.diagnosis.search.causes import LEAST_DIFFERENCE
+from processing.diagnosis.search.linearization import directions_of
 from processing.diagnosis.search.rules import LIMIT, NEEDED, TAKES_PART
 from processing.diagnosis.search.space import Space
 from processing.effect import EffectError
@@ -97,18 +98,26 @@ def likeliest_arrangement(problem: InstrumentProblem, declared: InstrumentModel 
     best, *close = (k for k in order if scores[k] > scores.max() - LEAST_DIFFERENCE)
     texts = [f"no mistake, but far values: {trains[0].text}" if trains[0].text else "none of these mistakes"]
     texts += [w.message for w in mistakes]
-    which = "; or ".join(texts[k] for k in (best, *close))
-    if close:
-        look = "look which is right" if problem.has_known_sample else "look which is right, or take air as well"
-        which = f"one of these ({look}): {which}"
+    which = _one_of([texts[k] for k in (best, *close)], problem)
     others = (*(texts[k] for k in close), *(train.text or "no far value" for train in trains[best].rivals))
     weights = np.exp(scores[[best, *close]] - scores.max())
     is_mistake = best > 0 or 1 - weights[0] / weights.sum() > TAKES_PART
     return Arrangement(which if is_mistake else None, others, problems[best], trains[best])
 
 
-def find_train_miswiring(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
-    """The mistake where the train has nominal values, none of which fit: each is judged by the best of them."""
+def _one_of(texts: Sequence[str], problem: InstrumentProblem) -> str:
+    """What is certain, or what the captures do not tell apart."""
+    look = "look which is right" if problem.has_known_sample else "look which is right, or take air as well"
+    return texts[0] if len(texts) == 1 else f"one of these ({look}): {'; or '.join(texts)}"
+
+
+def find_train_miswiring(
+    problem: InstrumentProblem, declared: InstrumentModel | None = None
+) -> tuple[str, InstrumentProblem] | None:
+    """The mistake where the train has nominal values, none of which fit: each is judged by the best of them.
+
+    Returns it in words, with those that fit as well, and the problem without it.
+    """
     base = Space(problem.nominal())
 
     def chi2(tried: InstrumentProblem) -> float:
@@ -117,7 +126,12 @@ def find_train_miswiring(problem: InstrumentProblem, declared: InstrumentModel |
 
     start, mistakes = chi2(problem), [(chi2(w.problem), w) for w in _possible(problem, declared)]
     found = [each for each in mistakes if each[0] < start / MUCH and start - each[0] > 2 * NEEDED]
-    return min(found, key=lambda each: each[0])[1] if found else None
+    if not found:
+        return None
+    (least, best), *others = sorted(found, key=lambda each: each[0])
+    close = 2 * LEAST_DIFFERENCE / directions_of(problem)
+    texts = [best.message, *(w.message for left, w in others if np.log(left / least) < close)]
+    return _one_of(texts, problem), best.problem
 
 
 def _chi2(problem: InstrumentProblem, space: Space, values: Array) -> float:
