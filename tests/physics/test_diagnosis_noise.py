@@ -1,11 +1,14 @@
 """Noise alone has no excess and no gradient, whatever is done to the counts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import chdtri, ndtr
 from steady_capture import steady_capture
 
 from processing.diagnosis.captures.unstated_noise import estimated_noise
+from processing.diagnosis.instrument.diagnose import white
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block, noise_information
@@ -118,3 +121,16 @@ def test_a_gradient_that_varies_more_leaves_the_minimum_and_widens_its_error():
     inverse = np.linalg.inv(curvature)
     assert np.linalg.solve(h, g) == pytest.approx(inverse @ gradient)
     assert np.linalg.inv(h) == pytest.approx(inverse @ (curvature + variance) @ inverse)
+
+
+def test_opposite_channels_of_a_state_are_no_course_over_the_states():
+    """Of two channels whose level is projected out one has what the other lacks."""
+    random = np.random.default_rng(8)
+    residual = Residual(np.zeros((128, 1, 1)), np.zeros(128), np.zeros(128), {}, {}, {}, np.zeros(128), 0.0)
+    seen = []
+    for course in (0.0, 3.0):
+        left = random.normal(size=(200, 64)) + course * np.sin(np.arange(64) / 6)
+        mean = np.stack([left, -left], axis=2).reshape(200, 128)
+        seen.append(np.mean([not white(replace(residual, mean=each), channels=2) for each in mean]))
+    assert seen[0] == 0
+    assert seen[1] > 0.5

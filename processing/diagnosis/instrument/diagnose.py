@@ -34,17 +34,20 @@ from processing.storage.captures.capture import Capture, CaptureError
 
 def has_structure(problem: InstrumentProblem, r: Residual) -> bool:
     """Whether a residual has structure; where its noise is unknown, of states beside each other."""
-    return bool(beyond_chance(r.tests)) if problem.noise_known else not white(r)
+    return bool(beyond_chance(r.tests)) if problem.noise_known else not white(r, len(problem.model.channels))
 
 
-def white(r: Residual) -> bool:
-    """Whether the mean residual of a state tells nothing of that of the next one."""
-    mean = r.mean[np.isfinite(r.mean)]
-    if mean.size <= LIMIT**2 or not np.any(mean):
+def white(r: Residual, channels: int) -> bool:
+    """Whether the mean residual of a state tells nothing of that of the next one.
+
+    Channels of one state go together: where its level is projected out, two of them are opposite.
+    """
+    mean = np.nan_to_num(r.mean).reshape(-1, channels)
+    if len(mean) <= LIMIT**2 or not np.any(mean):
         return True
-    centred = mean - mean.mean()
-    lag = float(centred[1:] @ centred[:-1] / (centred @ centred))
-    return bool(abs(lag) * np.sqrt(mean.size) < LIMIT)
+    centred = mean - mean.mean(axis=0)
+    lag = float(np.sum(centred[1:] * centred[:-1]) / np.sum(centred**2))
+    return bool(abs(lag) * np.sqrt(len(mean)) < LIMIT)
 
 
 def names_of(
