@@ -38,7 +38,7 @@ class Black:
     exposure_s : (D,) ascending; NaN where exposures are not known.
     states, frames : (D,) dark states and frames (states times repeats) of each exposure; 0 for a declared level.
     scatter : (D,) variance of the dark states about their mean, counts^2, and its standard error; NaN for one state.
-    zero_share : (D,) share of their counts that are cut off at zero, for which `means` are corrected.
+    cut_off : (D,) counts that were taken off `means`, because noise that is cut off at zero makes them too high.
     """
 
     means: NDArray[np.float32]
@@ -47,7 +47,7 @@ class Black:
     frames: Array
     scatter: Array
     scatter_stderr: Array
-    zero_share: Array = field(default_factory=lambda: np.zeros(1))
+    cut_off: Array = field(default_factory=lambda: np.zeros(1))
 
     @classmethod
     def level(cls, counts: float) -> "Black":
@@ -65,10 +65,10 @@ class Black:
         repeats = np.maximum(capture.column("repeats")[dark].astype(float), 1)
         means, groups = [], []
         for group in _groups(exposure):
-            mean, scatter, stderr = _mean_of(capture, dark[group])
-            share = _zero_share(capture, dark[group])
-            means.append(mean - np.float32(_cut_off(float(np.nanmean(mean)), share)))
-            groups.append([exposure[group].mean(), len(group), repeats[group].sum(), scatter, stderr, share])
+            mean, scatter, stderr, zero_share = _mean_of(capture, dark[group])
+            cut_off = _cut_off(float(np.nanmean(mean)), zero_share) if capture.integer_counts else 0.0
+            means.append(mean - np.float32(cut_off))
+            groups.append([exposure[group].mean(), len(group), repeats[group].sum(), scatter, stderr, cut_off])
         return cls(np.stack(means), *np.array(groups, dtype=float).T)
 
     @property
@@ -163,9 +163,9 @@ class Black:
     def warnings(self, exposure_s: ArrayLike) -> list[str]:
         """Warnings about exposures (N,) without their own darks, and about darks that are cut off at zero."""
         return self._without_own_darks(exposure_s) + [
-            f"{share:.0%} of the counts of the dark states are cut off at zero. What that adds to their mean was taken "
-            "off, as for normal noise. Raise the black level of the camera."
-            for share in self.zero_share[self.zero_share > MOST_CUT_OFF]
+            f"the counts of the dark states are cut off at zero, which makes their mean too high. {counts:.2g} counts "
+            "were taken off, as for normal noise. Raise the black level of the camera."
+            for counts in self.cut_off[self.cut_off != 0]
         ]
 
     def _without_own_darks(self, exposure_s: ArrayLike) -> list[str]:
@@ -201,15 +201,17 @@ def _groups(exposure: Array) -> list[NDArray[np.int64]]:
     return np.split(order, np.flatnonzero(steps) + 1)
 
 
-def _mean_of(capture: Capture, states: NDArray[np.int64]) -> tuple[NDArray[np.float32], float, float]:
-    """Mean frame of dark states, the variance of a state about it (counts^2), and that variance's standard error."""
-    n = len(states)
+def _mean_of(capture: Capture, states: NDArray[np.int64]) -> tuple[NDArray[np.float32], float, float, float]:
+    """Mean frame of dark states, variance of a state about it (counts^2), its standard error, and share of zeros."""
+    n, zeros = len(states), 0.0
     mean = np.zeros((capture.channels, *capture.frame_shape))
     for k in states:
-        mean += capture.frames(int(k))
+        frames = capture.frames(int(k))
+        mean += frames
+        zeros += float(np.mean(frames <= 0)) / n
     mean /= n
     if n == 1:
-        return mean.astype(np.float32), float("nan"), float("nan")
+        return mean.astype(np.float32), float("nan"), float("nan"), zeros
     each = []
     for k in states:
         # In blocks of rows: the whole image in floating numbers would be the largest thing in memory.
@@ -221,21 +223,14 @@ def _mean_of(capture: Capture, states: NDArray[np.int64]) -> tuple[NDArray[np.fl
         # A black level that moves as a whole is not noise of the pixels.
         each.append((sums[2] - sums[1] ** 2 / sums[0]) / sums[0] if sums[0] else float("nan"))
     scatter = float(np.mean(each)) * n / (n - 1)
-    return mean.astype(np.float32), scatter, scatter * float(np.sqrt(2 / ((n - 1) * mean.size)))
-
-
-def _zero_share(capture: Capture, states: NDArray[np.int64]) -> float:
-    """Share of the counts of some states that are zero; 0 where counts are means."""
-    if not capture.integer_counts:
-        return 0.0
-    return float(np.mean([np.mean(capture.frames(int(k), rows) <= 0) for k in states for rows in capture.row_blocks()]))
+    return mean.astype(np.float32), scatter, scatter * float(np.sqrt(2 / ((n - 1) * mean.size))), zeros
 
 
 def _cut_off(mean: float, zero_share: float) -> float:
-    """Counts by which a mean of normal noise is too high, as its values below one half are counts of zero.
+    """Counts by which the mean of normal noise is too high, as values below one half are counts of zero.
 
-    The share of zeros and the mean give both numbers of the normal distribution. Of counts of zero and one alone they
-    do not, and the mean is taken as it is.
+    The share of zeros and the mean give both numbers of the censored normal distribution (Tobin, Econometrica 26, 24,
+    1958). Of counts of zero and one alone they do not, and the mean is taken as it is.
     """
     rest = 1 - zero_share
     if zero_share <= MOST_CUT_OFF or mean < (1 + MOST_CUT_OFF) * rest:

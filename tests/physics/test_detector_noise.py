@@ -18,17 +18,8 @@ from processing.diagnosis.search.space import Space
 from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
-from processing.storage.captures.schema import Sample
 from simulators.blind.detector_cases import DETECTOR
-from simulators.blind.undeclared_captures import (
-    TrueBench,
-    TrueScene,
-    declared_bench,
-    digitize,
-    expose,
-    state_angles,
-    write_capture,
-)
+from simulators.blind.undeclared_captures import TrueBench, declared_bench
 
 STATES = 40
 OPTICS = "instruments/rgb950.yaml"
@@ -159,15 +150,12 @@ def test_a_small_bend_of_the_response_is_no_structure(bench_file, configs):
 
 def test_few_bright_pixels_do_not_tell_the_noise(configs, tmp_path):
     """Of a disc in a mosaic 40 super-pixels are far enough from the edge, and 90 of the dark background."""
-    file, angles = configs / "instruments/mosaic_polarimeter.yaml", {"psg": state_angles(16, True, False)["psg"]}
-    model, random = InstrumentModel.load(file).at(662), np.random.default_rng(6)
+    file = configs / "instruments/mosaic_polarimeter.yaml"
+    model = InstrumentModel.load(file).at(662)
     bench = declared_bench(model, 662.0, 46, mosaic=True, electrons=16_000.0)
     y, x = np.mgrid[:46, :46] - 22.5
     disc = gaussian_filter(np.where(np.hypot(x, y) < 16, 1.0, 0.01), 0.6)
     bench.light.append(lambda k, electrons: electrons * disc)
-    counts = digitize(bench, expose(bench, TrueScene(random), angles), random)
-    path = tmp_path / "capture.h5"
-    write_capture(path, bench, counts, angles, sample=Sample(kind="unknown"), instrument=file.read_text())
+    path = bench_capture(tmp_path, file, bench, states=16, seed=6, report_angles=lambda a: {"psg": a["psg"]})
     with Capture(path) as capture:
-        data = screen_capture(read_capture(capture, model), model, lambda line: None)
-    assert InstrumentProblem(model, [data]).captures[0].told_of_noise == ()
+        assert screen_capture(read_capture(capture, model), model, lambda line: None).told_of_noise == ()

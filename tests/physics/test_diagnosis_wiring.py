@@ -152,7 +152,6 @@ def test_a_quarter_turn_in_air_is_one_of_either_retarder(configs, tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.long
 def test_axes_of_a_nominal_train_in_air_turn_against_each_other(tmp_path):
     """Which of both turns the other way, the azimuths of all plates hide."""
     file, bench = tmp_path / "drr_single_detector.yaml", BENCHES["drr_single_detector"]
@@ -167,6 +166,7 @@ def test_axes_of_a_nominal_train_in_air_turn_against_each_other(tmp_path):
     assert all(f"axis {axis!r} turns the other way" in wiring for axis in ("psg", "psa"))
 
 
+@pytest.mark.long
 def test_a_mistake_is_told_where_the_train_has_nominal_values(configs, tmp_path):
     """Azimuths and retardances that `calibrate` leaves open do not mend an axis that turns the other way."""
     bench = TrueBench(rows=9, columns=9, og=np.deg2rad(-3.0), dg=np.deg2rad(120.0), oa=np.deg2rad(30.0))

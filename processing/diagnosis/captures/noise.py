@@ -80,7 +80,7 @@ def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
     looked_at[part] = (data.usable & ~data.clipped)[part]
     # Bright pixels have most of the noise, and count as the number of equal ones that scatters as much.
     weight = data.variance(looked_at).sum(axis=(0, 1), dtype=float)
-    if weight.sum() ** 2 < FEWEST_OF_MANY * np.sum(weight**2):
+    if weight.sum() ** 2 <= FEWEST_OF_MANY * np.sum(weight**2):
         return None
     white = Whitened.of(data, a, looked_at)
     if white.outside.shape[1] < FEWEST_FREE:

@@ -87,12 +87,10 @@ def likeliest_arrangement(problem: InstrumentProblem, declared: InstrumentModel 
     # Parts of the states, each with a sample of its own, may have as many unknowns as intensities.
     whole = problem.undivided() if problem.holds_out_states else problem
     nothing, none = Space(()), np.zeros(0)
-    start, possible = _chi2(whole, nothing, none), zip(*(_possible(p, declared) for p in (problem, whole)), strict=True)
-    believed = [
-        (w, undivided.problem) for w, undivided in possible if _chi2(undivided.problem, nothing, none) < start / MUCH
-    ]
-    mistakes, problems = [w for w, _ in believed], [problem, *(w.problem for w, _ in believed)]
-    trains = [likeliest_train(each, pairs=each is whole) for each in (whole, *(each for _, each in believed))]
+    start = _chi2(whole, nothing, none)
+    mistakes = [w for w in _possible(whole, declared) if _chi2(w.problem, nothing, none) < start / MUCH]
+    problems = [whole, *(w.problem for w in mistakes)]
+    trains = [likeliest_train(each, pairs=each is whole) for each in problems]
     scores = np.array([train.score - MISTAKE * (k > 0) for k, train in enumerate(trains)])
     order = [int(k) for k in np.argsort(-scores, kind="stable")]
     best, *close = (k for k in order if scores[k] > scores.max() - LEAST_DIFFERENCE)
@@ -102,7 +100,10 @@ def likeliest_arrangement(problem: InstrumentProblem, declared: InstrumentModel 
     others = (*(texts[k] for k in close), *(train.text or "no far value" for train in trains[best].rivals))
     weights = np.exp(scores[[best, *close]] - scores.max())
     is_mistake = best > 0 or 1 - weights[0] / weights.sum() > TAKES_PART
-    return Arrangement(which if is_mistake else None, others, problems[best], trains[best])
+    arranged = problems[best]
+    if problem.holds_out_states:
+        arranged = InstrumentProblem(arranged.models, arranged.still, folds=problem.folds)
+    return Arrangement(which if is_mistake else None, others, arranged, trains[best])
 
 
 def _one_of(texts: Sequence[str], problem: InstrumentProblem) -> str:

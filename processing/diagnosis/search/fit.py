@@ -101,7 +101,7 @@ def _descend(
             # A step fails because values that the data hardly determine go too far to be linear. So the damping is in
             # units of the prior. In units of the curvature such values would move by a thousandth of the way.
             step = bounded_step(g, h + damping * np.diag(weak), lower - x, upper - x, free=free)
-            # Nor where slopes are no numbers: so far away that the model has no intensities.
+            # It also ends where slopes are no numbers: so far away the model has no intensities.
             if not damping and not -step @ (2 * g + h @ step) >= enough:
                 return Fit(x, sums, float(sums.excess[use].sum()))
             tried = np.clip(x + step, lower, upper)
