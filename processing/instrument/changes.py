@@ -1,7 +1,7 @@
 """Changes by effects in the forward model of one capture: elements, gains and counts, state by state."""
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -87,11 +87,16 @@ def field_terms(x: Array, y: Array) -> Array:
     return np.stack([x, y, x * x - 1 / 3, x * y, y * y - 1 / 3])
 
 
+#: Changes by name that an element's own Mueller matrices depend on.
+OF_MATRICES = ("azimuth_rad", "retardance_rad", "extinction", "diattenuation", "depolarization")
+#: Changes by name that Mueller matrices behind and before an element depend on as well.
+OF_TRAINS = (*OF_MATRICES, "after", "before")
 #: Changes by name that add up.
-ADDED = (
-    *("azimuth_rad", "retardance_rad", "extinction", "diattenuation", "depolarization"),
-    *("field_retardance_rad", "response"),
-)
+ADDED = (*OF_MATRICES, "field_retardance_rad", "response")
+
+
+#: Matrices and vectors that were built before, by what they are and the changes of their elements.
+Built = dict[tuple[str | bytes | None, ...], Array]
 
 
 def _zeros() -> defaultdict[str, Array]:
@@ -138,8 +143,8 @@ class Changes:
     shift_px: Array = field(init=False)
     blur_px2: Array = field(init=False)
     drop_clipped: bool = False
-    #: Element matrices that were built before, for one model and capture; a fit changes one element at a time.
-    built: dict[tuple[str, bytes], Array] | None = None
+    #: For one model and capture; a fit changes one element at a time.
+    built: Built | None = None
 
     def __post_init__(self) -> None:
         self.gain, self.shift_px, self.blur_px2 = _nothing(self.conditions.states, len(self.conditions.channels))
@@ -168,20 +173,31 @@ class Changes:
             setattr(subset, name, defaultdict(of_all.default_factory, {key: among(x) for key, x in of_all.items()}))
         return subset
 
-    def key(self, element: str, azimuth_rad: Array) -> tuple[str, bytes]:
-        """Key of all changes on which the Mueller matrices of an element depend, without its own values."""
-        kinds = (self.retardance_rad, self.extinction, self.diattenuation, self.depolarization)
-        parts = (change.get(element) for change in kinds)
-        return element, b"|".join(
-            [azimuth_rad.tobytes(), *(b"" if p is None else np.asarray(p, float).tobytes() for p in parts)]
-        )
+    def copied(self, built: Built | None = None) -> "Changes":
+        """A copy to which others can be added."""
+        new = object.__new__(Changes)
+        own = {name: getattr(self, name).copy() for name in (*ADDED, "after", "before")}
+        vars(new).update(vars(self) | own, built=built)
+        return new
+
+    def once(self, what: str, elements: Sequence[str], kinds: Sequence[str], make: Callable[[], Array]) -> Array:
+        """What `make` returns, unless these kinds of changes of its elements were the same before."""
+        if self.built is None:
+            return make()
+        changes = [vars(self)[kind] for kind in kinds]
+        each = [c.get(name) for name in elements for c in changes]
+        key = (what, *(None if p is None else np.asarray(p, float).tobytes() for p in each))
+        if key not in self.built:
+            self.built[key] = make()
+        return self.built[key]
 
     def add(self, other: "Changes") -> None:
         """Add what others ask for, of the same conditions."""
         for name in ADDED:
-            total, more = getattr(self, name), getattr(other, name)
-            for key, value in more.items():
-                total[key] = total[key] + value
+            if more := getattr(other, name):
+                total = getattr(self, name)
+                for key, value in more.items():
+                    total[key] = total[key] + value if key in total else value
         for element, mueller in other.after.items():
             self.follow(element, mueller)
         for element, mueller in other.before.items():

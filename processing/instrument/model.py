@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, field_validator, model_validator
 
 from processing.arrays import Array
-from processing.instrument.changes import Changes
+from processing.instrument.changes import OF_MATRICES, OF_TRAINS, Changes
 from processing.instrument.elements import AnyElement, Stated, number
 from processing.instrument.elements import Dispersive as Dispersive
 from processing.instrument.elements import Element as Element
@@ -272,25 +272,35 @@ class InstrumentModel(Section):
     def generator_states(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Array:
         """Stokes vectors g (states, 4): first column of the generator train's Mueller matrix."""
         n = _state_count(angles_deg, changes)
-        stokes = np.zeros((n, 4))
-        stokes[:, 0] = 1.0
-        for element in self.generator:
-            stokes = np.einsum("nij,nj->ni", _matrices(element, angles_deg, n, changes), stokes)
-        return stokes
+
+        def states() -> Array:
+            stokes = np.zeros((n, 4))
+            stokes[:, 0] = 1.0
+            for element in self.generator:
+                stokes = np.einsum("nij,nj->ni", _matrices(element, angles_deg, n, changes), stokes)
+            return stokes
+
+        names = [e.name for e in self.generator]
+        return states() if changes is None else changes.once("generator", names, OF_TRAINS, states)
 
     def analyzer_states(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Array:
         """Analyzer vectors a (states, channels, 4): first row of each channel's train."""
         n = _state_count(angles_deg, changes)
-        common = [_matrices(e, angles_deg, n, changes) for e in self.analyzer]
-        vectors = np.empty((n, len(self.channels), 4))
-        for k, channel in enumerate(self.channels):
-            matrices = [_matrices(e, angles_deg, n, changes) for e in channel.elements]
-            row = np.zeros((n, 4))
-            row[:, 0] = number(channel.gain)
-            for matrix in reversed(common + matrices):
-                row = np.einsum("ni,nij->nj", row, matrix)
-            vectors[:, k] = row
-        return vectors
+
+        def states() -> Array:
+            common = [_matrices(e, angles_deg, n, changes) for e in self.analyzer]
+            vectors = np.empty((n, len(self.channels), 4))
+            for k, channel in enumerate(self.channels):
+                matrices = [_matrices(e, angles_deg, n, changes) for e in channel.elements]
+                row = np.zeros((n, 4))
+                row[:, 0] = number(channel.gain)
+                for matrix in reversed(common + matrices):
+                    row = np.einsum("ni,nij->nj", row, matrix)
+                vectors[:, k] = row
+            return vectors
+
+        names = [e.name for train in (self.analyzer, *(c.elements for c in self.channels)) for e in train]
+        return states() if changes is None else changes.once("analyzer", names, OF_TRAINS, states)
 
     def rows(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Array:
         """Measurement matrix W (states, channels, 16): row = kron(a, g), so that P = W . vec(M), row-major.
@@ -320,18 +330,15 @@ def rank(w: ArrayLike) -> int:
 
 
 def _matrices(element: Element, angles_deg: Mapping[str, ArrayLike], states: int, changes: Changes | None) -> Array:
-    azimuth = element.azimuth_rad(angles_deg, states)
+    def matrices() -> Array:
+        azimuth = element.azimuth_rad(angles_deg, states)
+        if changes is not None and element.name in changes.azimuth_rad:
+            azimuth = azimuth + changes.azimuth_rad[element.name]
+        return element.mueller(azimuth, changes)
+
     if changes is None:
-        return element.mueller(azimuth)
-    if element.name in changes.azimuth_rad:
-        azimuth = azimuth + changes.azimuth_rad[element.name]
-    key = changes.key(element.name, azimuth) if changes.built is not None else None
-    if changes.built is not None and key in changes.built:
-        matrix = changes.built[key]
-    else:
-        matrix = element.mueller(azimuth, changes)
-        if changes.built is not None and key is not None:
-            changes.built[key] = matrix
+        return matrices()
+    matrix = changes.once(element.name, [element.name], OF_MATRICES, matrices)
     if element.name in changes.before:
         matrix = matrix @ changes.before[element.name]
     return changes.after[element.name] @ matrix if element.name in changes.after else matrix

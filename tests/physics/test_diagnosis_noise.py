@@ -11,7 +11,7 @@ from processing.diagnosis.captures.unstated_noise import estimated_noise
 from processing.diagnosis.instrument.diagnose import white
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import moments_of
-from processing.diagnosis.instrument.projection import add_block, noise_information
+from processing.diagnosis.instrument.projection import add_blocks, noise_information
 from processing.diagnosis.instrument.structure import Residual, _tests, descriptions
 from processing.diagnosis.search.decision import in_deviations
 from processing.diagnosis.search.linearization import _with_noise_of_counts
@@ -44,7 +44,7 @@ def test_a_shift_or_a_bend_of_noise_promises_nothing(noisy, moved):
     dc[0, FEATURES.index("dx")] = random.normal(size=STATES)
     dc[1, FEATURES.index("dyy")] = random.normal(size=STATES)
     sums, (block,) = Sums.empty(1, 3), moments.blocks
-    add_block(block, a, c, np.zeros((3, *a.shape)), dc=dc, moments=moments, out=sums)
+    add_blocks([block], a, c, np.zeros((3, *a.shape)), dc=dc, moments=moments, out=sums)
     # Derivatives share noise with neighbours: the excess varies up to twice as much as with independent values.
     assert abs(sums.excess[0]) < 5 * np.sqrt(2 * 2 * sums.freedom[0])
     error = np.sqrt(np.diag(sums.curvature[0]))

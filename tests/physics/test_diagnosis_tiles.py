@@ -11,7 +11,7 @@ from steady_capture import steady_capture
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import FOLDS_OF_TILES, moments_of
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.projection import Projected, add_block
+from processing.diagnosis.instrument.projection import Projected, add_blocks
 from processing.diagnosis.instrument.slopes import slopes_of_rows
 from processing.diagnosis.instrument.tiles import TileSlopes, add_tiles, features_of_tiles, tile_columns
 from processing.diagnosis.search.space import Space, Sums
@@ -96,7 +96,7 @@ def test_tiles_that_are_all_alike_say_what_the_blocks_say(scene, shifted):
     da[:2] = random.normal(size=(2, *a.shape))
     blocks, tiles = Sums.empty(FOLDS_OF_TILES, 4), Sums.empty(FOLDS_OF_TILES, 4)
     for block in moments.blocks:
-        add_block(block, a, c, da, dc=dc, moments=moments, out=blocks)
+        add_blocks([block], a, c, da, dc=dc, moments=moments, out=blocks)
     count = moments.tiles.x.size
     none, counted = np.zeros(0, dtype=int), np.array([2, 3])
     slopes = TileSlopes(da[:, None], np.ones((1, count)), none, np.zeros((0, count, *a.shape)), counted, dc[counted])

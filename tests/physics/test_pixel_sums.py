@@ -10,7 +10,7 @@ from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.instrument import pixel_sums
 from processing.diagnosis.instrument.features import FEATURES, derivatives_of_part
 from processing.diagnosis.instrument.moments import moments_of
-from processing.diagnosis.instrument.projection import Projected, add_block
+from processing.diagnosis.instrument.projection import Projected, add_blocks
 from processing.diagnosis.instrument.tiles import TileSlopes, add_tiles
 from processing.diagnosis.search.space import Sums
 from processing.storage.captures.capture import Capture
@@ -38,7 +38,7 @@ def excess(a, data):
     c[0], c[FEATURES.index("square")], c[FEATURES.index("dx")] = 1.0, 1e-4, 1e-3
     sums = Sums.empty(2, 0)
     for block in moments.blocks:
-        add_block(block, a / moments.sigma[:, None], c, np.zeros((0, *a.shape)), dc=None, moments=moments, out=sums)
+        add_blocks([block], a / moments.sigma[:, None], c, np.zeros((0, *a.shape)), dc=None, moments=moments, out=sums)
     return moments, sums
 
 
@@ -152,8 +152,10 @@ def test_states_apart_are_what_a_column_for_each_of_them_says(cut_off):
     dc[3, FEATURES.index("square")] = random.normal(size=rows)
     of_state = np.arange(rows)[:, None] // CHANNELS == np.arange(FREE_STATES)
     together, apart = Sums.empty(1, VALUES), Sums.empty(1, VALUES)
-    add_block(block, np.where(of_state, a, 0.0), c, np.where(of_state, da, 0.0), dc=dc, moments=moments, out=together)
-    add_block(block, a, c, da, dc=dc, moments=moments, out=apart, apart=CHANNELS)
+    add_blocks(
+        [block], np.where(of_state, a, 0.0), c, np.where(of_state, da, 0.0), dc=dc, moments=moments, out=together
+    )
+    add_blocks([block], a, c, da, dc=dc, moments=moments, out=apart, apart=CHANNELS)
     for name in sizes:
         expected = getattr(together, name)
         assert getattr(apart, name) == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max()), name

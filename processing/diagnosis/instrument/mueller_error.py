@@ -87,7 +87,7 @@ class _SlopesOfPixels:
         space, local, moments = acting.space, acting.of(values), problem.moments[k]
         changes, columns = problem.changes(k, space, local), partial(_all_columns, problem, k)
         w, c = columns(changes), problem.coefficients(k, changes)
-        dw, dc = problem.slopes(k, space, local, w, columns=columns), problem.slopes_of_counts(k, space, local, c)
+        dw, dc = problem.slopes(k, space, local, w, c=c, columns=columns)
         free = problem.channels(k) if problem.has_free_level(k) else None
         return cls(w, c, dw, dc, 1 / moments.sigma[:, None], moments.counts, free)
 

@@ -20,7 +20,7 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.instrument.features import FEATURES
-from processing.diagnosis.instrument.moments import Moments, folds_of, moments_of
+from processing.diagnosis.instrument.moments import Block, Moments, folds_of, moments_of
 from processing.diagnosis.instrument.photon_noise import (
     about_mean,
     distance,
@@ -29,7 +29,7 @@ from processing.diagnosis.instrument.photon_noise import (
     undoing,
     with_noise_of_light,
 )
-from processing.diagnosis.instrument.projection import add_block, noise_information
+from processing.diagnosis.instrument.projection import add_blocks, noise_information
 from processing.diagnosis.instrument.slopes import Columns, slopes_of_counts, slopes_of_rows
 from processing.diagnosis.instrument.tiles import add_tiles, slopes_of_tiles, tile_columns
 from processing.diagnosis.search.candidate import Candidate, SourceLevel, nominal_values, pool
@@ -37,7 +37,7 @@ from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.rules import EXACT, KEPT
 from processing.diagnosis.search.space import Space, Sums
 from processing.instrument.applied_effects import changes_of
-from processing.instrument.changes import Changes
+from processing.instrument.changes import Built, Changes
 from processing.instrument.model import InstrumentModel
 
 #: [points] Of expansion that are kept besides the first: each has counts of its own.
@@ -174,7 +174,7 @@ class InstrumentProblem:
     def forget_linearizations(self) -> None:
         """Drop what was built for another model or other states; the moments of the counts stay."""
         self._others: list[InstrumentProblem] = []
-        self._built: list[dict[tuple[str, bytes], Array]] = [{} for _ in self.captures]
+        self._built: list[Built] = [{} for _ in self.captures]
         self._asked: list[dict[tuple[str, str, bytes], Changes]] = [{} for _ in self.captures]
 
     def with_models(self, models: Sequence[InstrumentModel]) -> InstrumentProblem:
@@ -385,8 +385,8 @@ class InstrumentProblem:
         a, c = self._columns_of_one_source(k, changes), self.coefficients(k, changes)
         da, dc = np.zeros((0, *a.shape)), None
         if derivatives:
-            da = self.slopes(k, space, values, a, columns=partial(self._columns_of_one_source, k))
-            dc = self.slopes_of_counts(k, space, values, c)
+            da, dc = self.slopes(k, space, values, a, c=c, columns=partial(self._columns_of_one_source, k))
+        together: dict[int, list[Block]] = {}
         for block in self.moments[k].blocks:
             if block.clipped and changes.drop_clipped:
                 # What is left of a clipped pixel is its states without any clipping, if they are enough.
@@ -394,22 +394,32 @@ class InstrumentProblem:
                     continue
                 block = replace(block, rows=block.sound)
             if block.rows.size:
-                add_block(block, a, c, da, dc=dc, moments=self.moments[k], out=out, apart=self._rows_apart(k))
+                together.setdefault(id(block.z), []).append(block)
+        for blocks in together.values():
+            add_blocks(blocks, a, c, da, dc=dc, moments=self.moments[k], out=out, apart=self._rows_apart(k))
 
-    def slopes(self, k: int, space: Space, values: Array, a: Array, *, columns: Columns) -> Array:
-        """Derivatives (values, ..., L, K) of the rows a (..., L, K) of a capture, which `columns` makes of changes."""
+    def slopes(
+        self, k: int, space: Space, values: Array, a: Array, *, c: Array, columns: Columns
+    ) -> tuple[Array, Array]:
+        """Derivatives of the rows a (..., L, K) of a capture and of the coefficients c (F, L) of its counts.
+
+        Each with one more axis in front, the values; `columns` makes the rows of changes.
+        """
         conditions, changes = self.captures[k].conditions, self._changes_about(k, space, values)
-        return slopes_of_rows(changes, self.models[k], conditions, space, values=values, a=a, columns=columns)
+        da = slopes_of_rows(changes, self.models[k], conditions, space, values=values, a=a, columns=columns)
+        return da, slopes_of_counts(changes, partial(self.coefficients, k), space, values, c=c)
 
     def _changes_about(self, k: int, space: Space, values: Array) -> Callable[[Array], Changes]:
         """Changes of values of which those of one candidate differ: all before it and behind it are joined once."""
-        none = Changes(self.captures[k].conditions)
+        none, built = Changes(self.captures[k].conditions), self._built[k]
 
         def joined(*parts: Changes) -> Changes:
-            total = Changes(none.conditions, built=self._built[k])
-            for part in parts:
-                if part is not none:
-                    total.add(part)
+            first, *others = [part for part in parts if part is not none] or [none]
+            if not others:
+                return first
+            total = first.copied(built)
+            for part in others:
+                total.add(part)
             return total
 
         pairs = space.pairs
@@ -420,7 +430,7 @@ class InstrumentProblem:
         def changes(moved: Array) -> Changes:
             differ = np.flatnonzero(moved != values)
             if not differ.size:
-                return joined(before[-1])
+                return before[-1].copied(built)
             i = space.owner(int(differ[0]))
             return joined(before[i], self._changes_of(k, pairs[i][0], moved[pairs[i][1]]), behind[i + 1])
 
@@ -428,7 +438,10 @@ class InstrumentProblem:
 
     def slopes_of_counts(self, k: int, space: Space, values: Array, c: Array) -> Array:
         """Derivatives (values, F, L) of the coefficients c (F, L) of the corrected counts of a capture."""
-        return slopes_of_counts(partial(self.changes, k, space), partial(self.coefficients, k), space, values, c=c)
+        if not any(candidate.acts_on_counts for candidate in space.candidates):
+            return np.zeros((space.size, *c.shape))
+        changes = self._changes_about(k, space, values)
+        return slopes_of_counts(changes, partial(self.coefficients, k), space, values, c=c)
 
     def _tile_sums(
         self, k: int, space: Space, values: Array, changes: Changes, *, out: Sums, derivatives: bool

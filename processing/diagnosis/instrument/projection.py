@@ -7,6 +7,8 @@ is one of the fitted image (H = Q Q^T); the residual is P of that. Q is much nar
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
+from copy import copy
 from functools import cached_property
 from typing import Any
 
@@ -30,9 +32,9 @@ class NoiseOfParts:
     of_features : (T, F, L) mean product of the residual's noise with that of each feature, as it reaches each row.
     """
 
-    def __init__(self, noise: Array, q: Array, outside: Array, c: Array, *, around: NDArray[np.bool_]) -> None:
-        """noise (T, L, F, F), q (T, L, K), outside P (T, L, L), c (T or 1, F, L); `around` (F,): the derivatives."""
-        self._noise, self._q, self._outside = noise, q, outside
+    def __init__(self, noise: Array, q: Array, free: Array, c: Array, *, around: NDArray[np.bool_]) -> None:
+        """noise (T, L, F, F), q (T, L, K), diagonal of P (T, L), c (T or 1, F, L); `around` (F,): the derivatives."""
+        self._noise, self._q, self._free = noise, q, free
         self._plain, self._around = np.flatnonzero(~around), np.flatnonzero(around)
         self._moving = self._around[np.any(c[:, self._around], axis=(0, 2))]
         self._c = c.swapaxes(1, 2)
@@ -41,14 +43,13 @@ class NoiseOfParts:
         self.of_features = self._of_features().swapaxes(1, 2)
 
     def _of_features(self) -> Array:
-        diagonal = np.diagonal(self._outside, axis1=1, axis2=2)[..., None]
-        noise_of = np.asarray(diagonal * self._joined)
+        noise_of = np.asarray(self._free[..., None] * self._joined)
         if not self._around.size:
             return noise_of
         hat = self._q @ self._q.transpose(0, 2, 1)
-        noise_of[..., self._around] = (hat * self._outside) @ self._joined[..., self._around]
+        noise_of[..., self._around] = (hat * _outside(hat)) @ self._joined[..., self._around]
         if self._moving.size:
-            narrow = self._outside[:, None] @ (self._q[:, None] * self._by_feature(self._c[..., self._moving]))
+            narrow = _off(self._q[:, None], self._q[:, None] * self._by_feature(self._c[..., self._moving]))
             # (T, M, L, L): from the noise of each row to the residual, by way of each derivative.
             takes = narrow @ self._q.transpose(0, 2, 1)[:, None]
             noise = self._noise[..., self._moving]
@@ -72,7 +73,7 @@ class NoiseOfParts:
             noise = self._noise[:, :, moving][..., moving]
             total = joined * back[:, None] + np.einsum("tlfg,tflk->tglk", noise, back_of)
             product += np.sum(c * fitted(self._q[:, None], total), axis=1)
-        return np.asarray(self._outside @ product)
+        return _off(self._q, product)
 
     @staticmethod
     def _by_feature(x: Array) -> Array:
@@ -83,6 +84,15 @@ class NoiseOfParts:
 def fitted(q: Array, x: Array) -> Array:
     """Q Q^T x (..., L, R) of orthonormal directions q (..., L, K)."""
     return np.asarray(q @ (q.swapaxes(-1, -2) @ x))
+
+
+def _off(q: Array, x: Array) -> Array:
+    """(1 - Q Q^T) x of the same."""
+    return np.asarray(x - fitted(q, x))
+
+
+def _outside(hat: Array) -> Array:
+    return np.asarray(np.eye(hat.shape[-1]) - hat)
 
 
 def add_response(counts: NDArray[Any], coefficients: Array, a: Array) -> NDArray[Any]:
@@ -127,8 +137,8 @@ def response_slopes(counts: NDArray[Any], coefficients: Array) -> NDArray[Any] |
     return slopes
 
 
-def add_block(
-    block: Block,
+def add_blocks(
+    blocks: Sequence[Block],
     a: Array,
     c: Array,
     da: Array,
@@ -138,36 +148,49 @@ def add_block(
     out: Sums,
     apart: int | None = None,
 ) -> None:
-    """Add what a block says of rows a (L, K) and coefficients c (F, L), with their derivatives by each value.
+    """Add what blocks of the same pixels say of rows a (L, K) and coefficients c (F, L), with their derivatives.
 
     `apart` : rows of a state, where every state has unknowns of its own; None: all rows have the same unknowns.
     """
-    dc = np.zeros((len(da), *c.shape)) if dc is None else dc
+    dc, block = np.zeros((len(da), *c.shape)) if dc is None else dc, blocks[0]
     used = np.flatnonzero(np.any(c, axis=1) | np.any(dc, axis=(0, 2)))
     around = used >= len(FEATURES) - DERIVATIVES
-    for rows in [block.rows[None]] if apart is None else _by_state(block.rows, apart):
+    for rows, fold in _of_each(blocks) if apart is None else _by_state(blocks, apart):
         # Without corrections of the counts, as few pseudo-pixels as there are rows say the same.
         z = block.counts[None, rows] if used.tolist() == [0] else block.z[used][:, rows]
-        sigma, noise = moments.sigma[rows], block.noise[rows][:, :, used][..., used]
-        part = Projected(
+        sigma, noise = moments.sigma[rows], block.noise[rows[..., None, None], used[:, None], used]
+        parts = Projected(
             z.swapaxes(0, 1) / sigma[:, None, :, None],
             noise / (sigma**2)[:, :, None, None],
             a[rows],
             c[used][:, rows].swapaxes(0, 1),
             around=around,
         )
-        add_parts(part, moments, rows, np.full(len(rows), float(block.pixels)), fold=block.fold, out=out)
-        if len(da):
-            gradient, stretch, curvature = part.slopes(da[:, rows], dc[:, used][:, :, rows].swapaxes(1, 2))
-            out.gradient[block.fold] += gradient
-            out.stretch[block.fold] += stretch
-            out.curvature[block.fold] += curvature
+        add_parts(parts, moments, rows, np.full(len(rows), float(block.pixels)), fold=fold, out=out)
+        for f in np.unique(fold) if len(da) else ():
+            some = np.flatnonzero(fold == f)
+            own, of_fold = rows[some], parts if some.size == fold.size else parts.among(some)
+            gradient, stretch, curvature = of_fold.slopes(da[:, own], dc[:, used][:, :, own].swapaxes(1, 2))
+            out.gradient[f] += gradient
+            out.stretch[f] += stretch
+            out.curvature[f] += curvature
 
 
-def _by_state(rows: NDArray[np.int64], apart: int) -> list[NDArray[np.int64]]:
-    """Rows (T, n) of T states each, of states that have the same number n of them."""
+def _of_each(blocks: Sequence[Block]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Rows (1, L) and fold (1,) of each block."""
+    for block in blocks:
+        yield block.rows[None], np.array([block.fold])
+
+
+def _by_state(blocks: Sequence[Block], apart: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Rows (T, n) and folds (T,) of T states each, of states that have the same number n of rows."""
+    rows = np.concatenate([b.rows for b in blocks])
+    fold = np.repeat([b.fold for b in blocks], [b.rows.size for b in blocks])
+    rows, fold = rows[order := np.argsort(rows)], fold[order]
     _, first, number = np.unique(rows // apart, return_index=True, return_counts=True)
-    return [rows[first[number == n][:, None] + np.arange(n)] for n in np.unique(number)]
+    for n in np.unique(number):
+        at = first[number == n]
+        yield rows[at[:, None] + np.arange(n)], fold[at]
 
 
 class Projected:
@@ -178,7 +201,7 @@ class Projected:
 
     Attributes
     ----------
-    outside : (T, L, L) projection P; residual : (T, L, R) P y; expected : (T,) squares of noise alone.
+    free : (T, L) diagonal of the projection P; residual : (T, L, R) P y; expected : (T,) squares of noise alone.
     unknowns : (T, R, K) A+ y, turned over.
     """
 
@@ -189,15 +212,21 @@ class Projected:
         q = u * keep[:, None, :]
         # A+, turned over.
         self._back = q * np.where(keep, 1 / np.maximum(size, 1e-300), 0.0)[:, None, :] @ vt
-        self.outside = np.eye(a.shape[1]) - q @ q.transpose(0, 2, 1)
-        self._noise = NoiseOfParts(noise, q, self.outside, c, around=around)
+        self._q, self.free = q, 1 - np.sum(q * q, axis=2)
+        self._noise = NoiseOfParts(noise, q, self.free, c, around=around)
         self._z = z
         if around.any():
             self._z = z.copy()
             self._z[:, around] = fitted(q[:, None], z[:, around])
         y = np.einsum("tfl,tflr->tlr", c, self._z)
-        self.residual, self.unknowns = self.outside @ y, y.transpose(0, 2, 1) @ self._back
-        self.expected = np.sum(c * self._noise.of_features, axis=(1, 2))
+        self.residual, self.unknowns = _off(q, y), y.transpose(0, 2, 1) @ self._back
+        self.of_features = self._noise.of_features
+        self.expected = np.sum(c * self.of_features, axis=(1, 2))
+
+    @cached_property
+    def outside(self) -> Array:
+        """Projection P (T, L, L)."""
+        return _outside(self._q @ self._q.transpose(0, 2, 1))
 
     @cached_property
     def by_rows(self) -> tuple[Array, Array]:
@@ -205,22 +234,30 @@ class Projected:
         carried = self._noise.carried(self._back)
         return carried - self.residual @ self.unknowns, -carried
 
+    def among(self, some: NDArray[np.int64]) -> Projected:
+        """Some of the parts."""
+        few = copy(self)
+        for name in ("_q", "_z", "free", "residual", "unknowns", "expected", "of_features"):
+            setattr(few, name, getattr(self, name)[some])
+        few.by_rows = self.by_rows[0][some], self.by_rows[1][some]
+        return few
+
     def pull_of_counts(self, dc: Array) -> Array:
         """Half gradient (K,) of the noise by what changes the coefficients, dc (K, T or 1, F, L)."""
-        of_features = self._noise.of_features
+        of_features = self.of_features
         return np.asarray(_flat(dc) @ (of_features.sum(axis=0) if dc.shape[1] == 1 else of_features).reshape(-1))
 
     def moved_by_counts(self, dc: Array) -> Array:
         """Change (T, L, R) of the residual by dc (T or 1, F, L) of one value."""
         used = np.flatnonzero(np.any(dc, axis=(0, 2)))
-        return np.asarray(self.outside @ np.einsum("tfl,tflr->tlr", dc[:, used], self._z[:, used]))
+        return _off(self._q, np.einsum("tfl,tflr->tlr", dc[:, used], self._z[:, used]))
 
     def slopes(self, da: Array, dc: Array) -> tuple[Array, Array, Array]:
         """Half gradient (K,) of the excess and of its noise, and curvature (K, K) of the excess, summed over the parts.
 
         Of da (K, T, L, K') and dc (K, T or 1, F, L); from dr = -P dA A+ y + P dB z.
         """
-        da = self.outside @ da
+        da = _off(self._q, da)
         of_excess, of_noise = self.by_rows
         pull = self.pull_of_counts(dc) + _flat(da) @ of_noise.reshape(-1)
         gradient = _flat(da) @ of_excess.reshape(-1) - self.pull_of_counts(dc)
@@ -242,25 +279,33 @@ class Projected:
         Of da (L, K') and dc (F, L), as in `slopes`.
         """
         by_counts = self.moved_by_counts(dc[None])
-        da = self.outside @ da
+        da = _off(self._q, da)
         gradient = np.sum(da * self.by_rows[0], axis=(1, 2)) + np.sum(by_counts * self.residual, axis=(1, 2))
-        gradient -= np.sum(dc * self._noise.of_features, axis=(1, 2))
+        gradient -= np.sum(dc * self.of_features, axis=(1, 2))
         return gradient, np.sum((by_counts - da @ self.unknowns.transpose(0, 2, 1)) ** 2, axis=(1, 2))
 
 
 def add_parts(
-    parts: Projected, moments: Moments, rows: NDArray[np.int64], pixels: NDArray[np.floating], *, fold: int, out: Sums
+    parts: Projected,
+    moments: Moments,
+    rows: NDArray[np.int64],
+    pixels: NDArray[np.floating],
+    *,
+    fold: NDArray[np.int64],
+    out: Sums,
 ) -> None:
-    """Add what parts of one fold leave.
+    """Add what parts leave.
 
-    `rows` (T or 1, L) : of each part; `pixels` (T,) : how many stand behind it.
+    `rows` (T or 1, L) : of each part; `pixels` (T,) : how many stand behind it; `fold` (T,).
     """
-    squares, expected = np.sum(parts.residual**2, axis=2), float(parts.expected.sum())
-    free = pixels[:, None] * np.diagonal(parts.outside, axis1=1, axis2=2)
-    out.excess[fold] += squares.sum() - expected
-    out.freedom[fold] += expected
-    out.square[fold] += np.sum(squares * moments.sigma[rows] ** 2) * moments.relative
-    out.count[fold] += np.sum(free * moments.shown[rows])
+    squares = np.sum(parts.residual**2, axis=2)
+    for total, each in (
+        (out.excess, squares.sum(axis=1) - parts.expected),
+        (out.freedom, parts.expected),
+        (out.square, np.sum(squares * moments.sigma[rows] ** 2, axis=1) * moments.relative),
+        (out.count, pixels * np.sum(parts.free * moments.shown[rows], axis=1)),
+    ):
+        np.add.at(total, fold, each)
 
 
 def noise_information(block: Block, a: Array, dc: Array, moments: Moments) -> tuple[Array, Array]:

@@ -300,7 +300,7 @@ def add_tiles(
         for some in np.split(in_fold, range(TILES_TOGETHER, in_fold.size, TILES_TOGETHER)):
             features = z[some[:, None], index, selection]
             part = Projected(features, scatter[some], a[some][:, rows], c[None, used][:, :, rows], around=around)
-            add_parts(part, moments, rows[None], tiles.pixels[some], fold=fold, out=out)
+            add_parts(part, moments, rows[None], tiles.pixels[some], fold=tiles.fold[some], out=out)
             yield some, part
 
     bounds = [] if apart is None else (np.flatnonzero(np.diff(use // apart)) + 1).tolist()

@@ -19,7 +19,7 @@ from processing.diagnosis.search.causes import LEAST_DIFFERENCE
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.linearization import directions_of
 from processing.diagnosis.search.range_of import NEARLY_ZERO
-from processing.diagnosis.search.rules import BENT, FAR_OFF, LIMIT, ROUNDS
+from processing.diagnosis.search.rules import BENT, FAR_OFF, LIMIT, LITTLE, ROUNDS
 from processing.diagnosis.search.space import Space
 
 #: [degree] Between the angles at which a fit may start, for each of those that are far at once.
@@ -124,16 +124,25 @@ class _Fits:
         return Train(self.space, values, -0.5 * self._directions * float(np.log(unit)) - cost, unit)
 
     def reweighted(self, starts: Iterable[Array]) -> list[Train]:
-        """The likeliest train near each start (K,), of all steps from it."""
-        return [_best(self._steps(self.at(start))) for start in starts]
+        """The likeliest train near each start (K,), of all steps from it.
 
-    def _steps(self, train: Train) -> list[Train]:
-        steps = [train]
+        Where a path comes to a place that was reached before, it goes on as the one that reached it did.
+        """
+        paths, reached = [[self.at(start)] for start in starts], list[Array]()
+        going = paths
         for _ in range(ROUNDS):
-            weak = 2 * train.unit / (self._typical**2 + train.values**2)
-            fit = minimize(self.problem, self.space, train.values, weak=weak, expansions=0)
-            steps.append(train := self.at(fit.values))
-        return steps
+            still = []
+            for path in going:
+                path.append(train := self._step(path[-1]))
+                if not any(np.all(np.abs(train.values - x) < LITTLE * self._typical) for x in reached):
+                    still.append(path)
+                reached.append(train.values)
+            going = still
+        return [_best(path) for path in paths]
+
+    def _step(self, train: Train) -> Train:
+        weak = 2 * train.unit / (self._typical**2 + train.values**2)
+        return self.at(minimize(self.problem, self.space, train.values, weak=weak, expansions=0).values)
 
     def _far_starts(self, values: Array, at_once: int) -> list[Array]:
         """Values (K,) with one angle changed or two, the two best of each choice, those that explain most first."""

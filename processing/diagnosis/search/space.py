@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -86,7 +87,12 @@ class Acting:
 
     def spread(self, slopes: Array) -> Array:
         """Derivatives (..., J) by the common values, of those (..., own values)."""
-        return np.asarray(slopes[..., self.own] * self.weight)
+        return slopes if self._is_plain else np.asarray(slopes[..., self.own] * self.weight)
+
+    @cached_property
+    def _is_plain(self) -> bool:
+        """Whether each common value is one of `space`, as it is."""
+        return np.array_equal(self.own, np.arange(self.space.size)) and bool(np.all(self.weight == 1))
 
     def spread_products(self, products: Array) -> Array:
         """The same of products (..., own values, own values)."""
