@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from emulated_instruments import BENCHES, INSTRUMENTS, SAMPLE, Array, Bench, Wrong, emulated_capture
 from scipy.optimize import least_squares
 
 from processing.diagnosis.instrument.diagnose import diagnose_captures
@@ -28,6 +27,7 @@ from processing.storage.formats.import_request import ImportRequest, read_sample
 from processing.storage.formats.importing import import_capture
 from processing.storage.products.product import Product
 from processing.yaml_file import dump_yaml
+from simulators.blind.emulated_instruments import BENCHES, INSTRUMENTS, SAMPLE, Array, Bench, Wrong, emulated_capture
 
 #: Where public measured data are that may not be in the tree.
 DATA = Path(os.environ.get("UMOV_DATA", INSTRUMENTS.parents[2] / "shared" / "data"))

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from benchmarks import instrument_chain as chain
-from benchmarks.emulated_instruments import BENCHES, OF_AIR, Bench, emulated_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.instrument.model import InstrumentModel
 from processing.yaml_file import dump_yaml
+from simulators.blind.emulated_instruments import BENCHES, OF_AIR, Bench, emulated_capture
 
 
 def test_every_instrument_has_its_line(configs):

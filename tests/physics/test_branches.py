@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from benchmarks.emulated_instruments import BENCHES, INSTRUMENTS, SAMPLE, emulated_capture
 from benchmarks.instrument_chain import means_of, relative
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument_file import write_instrument
 from processing.instrument.model import InstrumentModel
 from processing.steps.reduction import Reduction
 from processing.yaml_file import dump_yaml
+from simulators.blind.emulated_instruments import BENCHES, INSTRUMENTS, SAMPLE, emulated_capture
 
 PLATES = ("psg_retarder", "psa_retarder")
 #: Instruments with two plates, and by how many degrees the azimuth of the second one is off.

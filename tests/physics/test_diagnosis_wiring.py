@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from bench_capture import bench_capture, read
-from emulated_instruments import BENCHES, INSTRUMENTS, SAMPLE, emulated_capture
 
 from processing.computing.blas import one_blas_thread
 from processing.diagnosis.instrument.diagnose import diagnose, diagnose_captures
@@ -12,6 +11,7 @@ from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.instrument.wiring import find_train_miswiring, likeliest_arrangement
 from processing.diagnosis.verdict.report import write_diagnosis_report
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
+from simulators.blind.emulated_instruments import BENCHES, INSTRUMENTS, SAMPLE, emulated_capture
 from simulators.blind.undeclared_captures import TrueBench
 
 

@@ -12,9 +12,9 @@ from processing.storage.captures.schema import Detector
 from processing.storage.formats.import_request import ImportRequest, read_sample
 from processing.storage.formats.importing import import_capture
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
-INSTRUMENTS = Path(__file__).resolve().parents[1] / "configs/instruments"
+INSTRUMENTS = Path(__file__).resolve().parents[2] / "configs/instruments"
 #: Another sample: a turned plate of 100 degrees behind a weak diattenuator, half of it depolarized.
 SAMPLE = 0.7 * mueller.retarder(0.4, 1.75) @ mueller.diattenuator(0.9, 1.0, 0.7) + 0.3 * mueller.IDEAL_DEPOLARIZER
 NOISE, COUNTS, BLACK, READ = 1e-3, 20_000.0, 100, 3.0
