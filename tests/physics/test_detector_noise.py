@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from bench_capture import bench_capture
 from scipy.ndimage import gaussian_filter
+from steady_capture import steady_capture
 
 from processing.diagnosis.captures.capture_data import CaptureData
-from processing.diagnosis.captures.noise import _compare
+from processing.diagnosis.captures.noise import _compare, detector_noise
 from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.captures.screening import screen_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
@@ -131,6 +132,19 @@ def test_a_correlation_of_neighbours_is_as_uncertain_as_bright_pixels_are_few():
     ]
     scatter = max(np.std([f.right for f in found]), np.std([f.down for f in found]))
     assert np.mean([f.alike_error for f in found]) == pytest.approx(scatter, rel=0.3)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_noise_of_few_bright_pixels_beside_dark_ones_is_no_structure(seed):
+    """A bright stripe, a sixth of the image: its noise goes together in the pixels of the whole no more than chance."""
+    random, states, side = np.random.default_rng(seed), 64, 27
+    light = np.where(np.arange(side) // 4 == 3, 0.5, 0.005)
+    rows = random.normal(size=(states, 4)) + 2
+    slope, floor = 1e-5, 1e-4
+    clean = np.broadcast_to(light * (rows / rows.mean()).mean(axis=1)[:, None, None], (states, side, side))
+    noise = np.sqrt(slope * clean + floor**2) * random.normal(size=clean.shape)
+    noise_found = detector_noise(steady_capture(clean + noise, floor, slope), rows)
+    assert abs(noise_found.white - 1) < 4 * noise_found.white_error
 
 
 def test_a_small_bend_of_the_response_is_no_structure(bench_file, configs):

@@ -87,16 +87,23 @@ class Whitened:
     def projector(self, clean: NDArray[np.bool_]) -> Array:
         """Projection (L, L) on what neither the model reaches nor the residual of the `clean` pixels has in common."""
         outside = self.outside.astype(np.float32)
-        r = outside @ (outside.T @ (self.y if clean.all() else self.y[:, clean]))
+        y, variance = (self.y, self.variance) if clean.all() else (self.y[:, clean], self.variance[:, clean])
+        r = outside @ (outside.T @ y)
         scale = robust_scale(r).astype(np.float32)
         inner = (outside.T @ np.clip(r, -LIMIT * scale, LIMIT * scale, out=r)).astype(float)
         value, vector = np.linalg.eigh(inner @ inner.T / inner.shape[1])
         # Largest eigenvalue of noise over the median one (Marchenko and Pastur); beyond it all pixels share structure.
-        edge = GROWTH * (1 + np.sqrt(len(value) / inner.shape[1])) ** 2
+        # Bright pixels beside dark ones have most of the noise, and so few equal ones would scatter as much.
+        edge = GROWTH * (1 + np.sqrt(len(value) / _count_equal(variance.mean(axis=0, dtype=float)))) ** 2
         # At least half of the directions are left to tell what noise is.
         half = len(value) // 2
         structure = self.outside @ vector[:, half:][:, value[half:] > edge * np.median(value)]
         return np.asarray(self.outside @ self.outside.T - structure @ structure.T)
+
+
+def _count_equal(weight: Array) -> float:
+    """How many parts of equal weight have a sum that scatters as one of parts of these weights (P,)."""
+    return float(weight.sum() ** 2 / np.sum(weight**2))
 
 
 def robust_scale(r: NDArray[np.floating]) -> Array:
