@@ -173,6 +173,12 @@ class Changes:
             setattr(subset, name, defaultdict(of_all.default_factory, {key: among(x) for key, x in of_all.items()}))
         return subset
 
+    @property
+    def corrects_counts(self) -> bool:
+        """Whether anything is added to the counts."""
+        _, shift_px, blur_px2 = _nothing(self.conditions.states, len(self.conditions.channels))
+        return bool(self.response) or self.shift_px is not shift_px or self.blur_px2 is not blur_px2
+
     def copied(self, built: Built | None = None) -> "Changes":
         """A copy to which others can be added."""
         new = object.__new__(Changes)

@@ -248,7 +248,7 @@ class InstrumentProblem:
             changes = Changes(data.conditions) if candidate else changes_of(model, data.conditions, data.name)
             if candidate:
                 candidate.apply(changes, model, values)
-            else:
+            elif self.own_px[capture].any():
                 changes.shift_px = changes.shift_px - self.own_px[capture] * data.pitch
             cache[key] = changes
         return cache[key]
@@ -306,6 +306,8 @@ class InstrumentProblem:
         channels = len(self.captures[capture].conditions.channels)
         c = np.zeros((len(FEATURES), rows))
         c[0] = 1.0
+        if not changes.corrects_counts:
+            return c
         for name, value in changes.response.items():
             c[FEATURES.index(name)] += np.ravel(value)
         # What shift and blur took away, to second order, from derivatives of the fitted image at the mean shift.

@@ -142,7 +142,8 @@ class _Fits:
 
     def _step(self, train: Train) -> Train:
         weak = 2 * train.unit / (self._typical**2 + train.values**2)
-        return self.at(minimize(self.problem, self.space, train.values, weak=weak, expansions=0).values)
+        fit = minimize(self.problem, self.space, train.values, weak=weak, unit=train.unit, expansions=0)
+        return self.at(fit.values)
 
     def _far_starts(self, values: Array, at_once: int) -> list[Array]:
         """Values (K,) with one angle changed or two, the two best of each choice, those that explain most first."""

@@ -28,8 +28,8 @@ def all_at_once(
     values = x[positions]
     for _ in range(ROUNDS):
         sums = problem.sums(part, values, derivatives=False)
-        weak = noise.unit(sums.chi2(problem.noise_known)) / width**2
-        new = minimize(problem, part, values, steps=3, expansions=0, weak=weak).values
+        unit = noise.unit(sums.chi2(problem.noise_known))
+        new = minimize(problem, part, values, steps=3, expansions=0, weak=unit / width**2, unit=unit).values
         moved, values = np.max(np.abs(new - values) / width), new
         if not problem.relinearize(part, values) and moved < EXACT:
             break
@@ -79,7 +79,7 @@ def descend(
         places = [x[positions] for x in starts]
         chi2 = [problem.sums(part, x, derivatives=False).excess.sum() + weak @ x**2 for x in places]
         best = places[int(np.argmin(np.nan_to_num(chi2, nan=np.inf)))]
-        values[positions] = minimize(problem, part, best, expansions=0, weak=weak).values
+        values[positions] = minimize(problem, part, best, expansions=0, weak=weak, unit=samples.best.unit).values
     return values
 
 
@@ -98,7 +98,7 @@ def minimum_of(problem: Problem, space: Space, sets: Sets, state: State) -> tupl
     values = np.zeros(space.size)
     weak = state.unit / (tau * typical)[positions] ** 2
     start = (linear * typical)[positions]
-    minimum = minimize(problem, part, start, expansions=0, weak=weak)
+    minimum = minimize(problem, part, start, expansions=0, weak=weak, unit=state.unit)
     values[positions] = minimum.values
     return values, minimum.sums.chi2(problem.noise_known) + float(weak @ minimum.values**2)
 

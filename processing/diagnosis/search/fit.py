@@ -19,7 +19,7 @@ from processing.diagnosis.search.space import Problem, Space, Sums
 LEAST_FREEDOM = 0.2
 #: [steps] Of a fit.
 STEPS = 15
-#: [chi-square] The fit ends when a step gains less than this.
+#: [unit of chi-square] The fit ends when a step gains less than this.
 LEAST_GAIN = 0.05
 
 
@@ -52,11 +52,13 @@ def minimize(
     steps: int = STEPS,
     expansions: int = ROUNDS,
     weak: Array | None = None,
+    unit: float = 1.0,
     at_start: Sums | None = None,
 ) -> Fit:
     """Least chi-square over its stretch by Levenberg-Marquardt with bounds, on the data of the folds given.
 
     `weak` (K,) is the curvature of the prior; default: `prior`. Some values may be held, others are `free` (K,).
+    The fit ends when a step gains little, in units of chi-square of so much (`unit`).
     Corrections of counts are expanded about the start, and at most `expansions` times anew about where the fit ended.
     `at_start`: the sums at the start, if they are known. Those of the fit may be without derivatives.
     """
@@ -67,7 +69,7 @@ def minimize(
     for _ in range(1 + (expansions if folds is None else 0)):
         if folds is None and not problem.relinearize(space, start) and fit is not None:
             break
-        fit = _descend(problem, space, start, use, free=move, steps=steps, weak=weak, sums=at_start)
+        fit = _descend(problem, space, start, use, free=move, steps=steps, weak=weak, unit=unit, sums=at_start)
         start, at_start = fit.values, None
     assert fit is not None
     return fit
@@ -82,6 +84,7 @@ def _descend(
     free: NDArray[np.bool_],
     steps: int,
     weak: Array,
+    unit: float,
     sums: Sums | None,
 ) -> Fit:
     lower, upper = space.joined("lower"), space.joined("upper")
@@ -91,12 +94,12 @@ def _descend(
     cost = _penalize(sums, weak, x, use, reference=reference)
     for _ in range(steps):
         # A bend of the response stretches residual and noise alike, which is no gain.
-        unit = sums.excess[use].sum() / max(float(sums.freedom[use].sum()), 1e-300)
-        g = sums.gradient[use].sum(axis=0) - unit * sums.stretch[use].sum(axis=0) + weak * x
+        stretched = sums.excess[use].sum() / max(float(sums.freedom[use].sum()), 1e-300)
+        g = sums.gradient[use].sum(axis=0) - stretched * sums.stretch[use].sum(axis=0) + weak * x
         h = sums.curvature[use].sum(axis=0) + np.diag(weak)
         if not free.any():
             break
-        enough = LEAST_GAIN + RANK * abs(cost)
+        enough = LEAST_GAIN * unit + RANK * abs(cost)
         while True:
             # A step fails because values that the data hardly determine go too far to be linear. So the damping is in
             # units of the prior. In units of the curvature such values would move by a thousandth of the way.
