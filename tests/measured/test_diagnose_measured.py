@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy import optimize
 
 from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
@@ -138,20 +139,30 @@ def test_terms_of_even_wavelengths_predict_whole_states_of_odd_ones(public_files
 
 
 def test_values_at_a_bound_leave_the_others_at_their_minimum(public_files, configs, tmp_path):
-    """Of depolarizations that noise takes below what is possible, and a retardance that is far off."""
+    """Of depolarizations that noise takes below what is possible, and a far retardance: SciPy finds no lower one."""
     instrument = configs / "instruments/dual_beam_charis.yaml"
     model = InstrumentModel.load(instrument)
-    paths = [path for _, path in sorted(telescope(public_files, tmp_path, instrument).items())][::2]
+    paths = [path for _, path in sorted(telescope(public_files, tmp_path, instrument).items())][::4]
     models, data = [], []
     for path in paths:
         with Capture(path) as capture:
             models.append(model.nominal_at(capture.header.wavelength_nm))
             data.append(read_capture(capture, models[-1]))
     bench = WholeBench(InstrumentProblem(models, data), print)
-    start = bench.base.vector(bench.start)
-    fit = minimize(bench.problem, bench.base, start)
-    assert np.any((fit.values <= bench.base.joined("lower")) | (fit.values >= bench.base.joined("upper")))
-    assert fit.rms < 1.001 * minimize(bench.problem, bench.base, start, steps=200).rms
+    space, problem = bench.base, bench.problem
+    fit = minimize(problem, space, space.vector(bench.start))
+    lower, upper, typical = (space.joined(name) for name in ("lower", "upper", "typical"))
+    assert np.any((fit.values <= lower) | (fit.values >= upper))
+
+    def chi2(x):
+        sums, weak = problem.sums(space, x * typical), prior(space) * x * typical
+        slope = sums.gradient.sum(axis=0) + weak
+        return sums.excess.sum() + weak @ (x * typical), 2 * slope * typical
+
+    bounds = list(zip(lower / typical, upper / typical, strict=True))
+    start = fit.values / typical
+    best = optimize.minimize(chi2, start, jac=True, bounds=bounds, method="L-BFGS-B", options={"maxiter": 300})
+    assert best.fun > chi2(start)[0] * (1 - 0.002)
 
 
 def one_detector(public_files, folder: Path, instrument: Path, wavelength_nm: int, beside: int) -> Path:

@@ -33,9 +33,13 @@ def diagnosed(tried):
     [
         (lambda a: a | {"psa": -a["psa"]}, "'psa' turns the other way"),
         (lambda a: {"psg": a["psa"], "psa": a["psg"]}, "each other's place"),
-        (lambda a: a | {"psg": 2 * a["psg"]}, "'psg' are told in half degrees"),
+        pytest.param(lambda a: a | {"psg": 2 * a["psg"]}, "'psg' are told in half degrees", marks=pytest.mark.long),
         (lambda a: {k: 2 * v for k, v in a.items()}, "'psa' and 'psg' are told in half degrees"),
-        (lambda a: {k: v / 2 for k, v in a.items()}, "'psa' and 'psg' are told in units of two degrees"),
+        pytest.param(
+            lambda a: {k: v / 2 for k, v in a.items()},
+            "'psa' and 'psg' are told in units of two degrees",
+            marks=pytest.mark.long,
+        ),
         (lambda a: a | {"psa": a["psa"] * 4.91 / 5}, "5 instead of 4.91"),
         (lambda a: {k: np.roll(v, 1) for k, v in a.items()}, "one early"),
     ],
