@@ -13,6 +13,7 @@ from processing.diagnosis.search.fit import Fit, Solution, held_out, minimize, p
 from processing.diagnosis.search.rules import NEEDED
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.verdict.answer import checks
+from processing.storage.captures.capture import CaptureError
 from simulators.blind.undeclared_captures import TrueBench
 
 SIDE = 24
@@ -105,6 +106,14 @@ def test_pixels_at_an_edge_are_left_out_and_those_of_a_slope_are_not(configs, tm
     # All edges: there is nothing else to look at than the flattest quarter.
     stripes = 0.2 + 0.4 * np.arange(SIDE) / SIDE * (np.arange(SIDE) % 2)
     assert left(stripes).usable.mean() == pytest.approx(0.25, abs=0.05)
+
+
+def test_pixels_at_the_rim_alone_are_an_error_in_words(configs, tmp_path):
+    model, data = captured(tmp_path, configs, TrueBench(rows=SIDE, columns=SIDE))
+    rim = np.ones((SIDE, SIDE), dtype=bool)
+    rim[2:-2, 2:-2] = False
+    with pytest.raises(CaptureError, match="no pixel is bright"):
+        InstrumentProblem(model, [replace(data, usable=rim)])
 
 
 @pytest.mark.parametrize("bend", [-0.1, 0.1])

@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from processing.arrays import Array, BoolArray
 from processing.diagnosis.captures.capture_data import CaptureData
 from processing.diagnosis.captures.read_capture import FEW_PIXELS
-from processing.diagnosis.instrument.features import FEATURES
+from processing.diagnosis.instrument.features import FEATURES, MARGIN
 from processing.diagnosis.instrument.pixel_sums import Pixels, Precision, features_of_pixels, products_of_pixels
 from processing.diagnosis.search.range_of import RANK
 from processing.diagnosis.search.rules import FOLDS_OF_TILES, TILES
 from processing.instrument.changes import places
+from processing.storage.captures.capture import CaptureError
 
 #: [intensities of a pixel] Beyond which states are held out, not tiles of the image.
 MOST_ROWS_FOR_TILES = 100
@@ -126,8 +127,16 @@ def folds_of(captures: Sequence[CaptureData]) -> int:
 
 
 def moments_of(data: CaptureData, folds: int) -> Moments:
-    """Build the moments of a capture, to be held out in so many parts."""
+    """Build the moments of a capture, to be held out in so many parts.
+
+    Raises CaptureError: no pixel counts.
+    """
     pixels, channels = Pixels(data), data.signal.shape[1]
+    if not pixels.good.any():
+        raise CaptureError(
+            f"{data.name}: no pixel is bright, away from sharp edges and {MARGIN} pixels from the rim of the image. "
+            "Take a larger region of the camera, or one that the sample fills."
+        )
     means = pixels.means()
     # Where too much was subtracted a dark state is negative all over; its noise is not less than that of the read-out.
     sigma = np.sqrt(np.maximum(means.share, np.repeat(data.floor, channels) / 2 * means.inverse))
