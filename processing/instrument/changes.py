@@ -157,6 +157,7 @@ class Changes:
             return x[chosen] if np.ndim(x) and len(x) == states else x
 
         subset = copy(self)
+        subset.built = None
         subset.conditions = replace(
             c,
             angles_deg={axis: angle[chosen] for axis, angle in c.angles_deg.items()},

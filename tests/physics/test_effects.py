@@ -14,7 +14,7 @@ import pytest
 import processing
 from processing.effect import BASE, EffectError, load_effects
 from processing.instrument.applied_effects import apply_to, changes_at, changes_of, instrument_effects
-from processing.instrument.changes import Changes
+from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects.base import InstrumentEffect
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
@@ -152,6 +152,17 @@ def test_no_file_imports_an_effect():
             else:
                 continue
             assert not names & effects, f"{path} imports {names & effects}"
+
+
+def test_some_of_the_states_have_matrices_of_their_own(rgb950):
+    conditions = Conditions.of({"psg": 7.0 * np.arange(12), "psa": 34.0 * np.arange(12)})
+    changes = Changes(conditions, built={})
+    changes.retardance_rad["psa_retarder"] = np.array(0.02)
+    whole, again = (rgb950.rows(conditions.angles_deg, changes) for _ in range(2))
+    assert np.array_equal(whole, again)
+    chosen = np.array([1, 4, 9])
+    some = changes.of_states(chosen)
+    assert rgb950.rows(some.conditions.angles_deg, some) == pytest.approx(whole[chosen])
 
 
 def test_files_go_and_come_in_a_copy(tmp_path, configs):
