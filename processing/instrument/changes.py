@@ -89,12 +89,10 @@ def field_terms(x: Array, y: Array) -> Array:
 
 #: Changes by name that an element's own Mueller matrices depend on.
 OF_MATRICES = ("azimuth_rad", "retardance_rad", "extinction", "diattenuation", "depolarization")
-#: Changes by name that Mueller matrices behind and before an element depend on as well.
+#: Changes by name that the vectors of a generator or an analyzer depend on.
 OF_TRAINS = (*OF_MATRICES, "after", "before")
 #: Changes by name that add up.
 ADDED = (*OF_MATRICES, "field_retardance_rad", "response")
-
-
 #: Matrices and vectors that were built before, by what they are and the changes of their elements.
 Built = dict[tuple[str | bytes | None, ...], Array]
 
@@ -143,7 +141,7 @@ class Changes:
     shift_px: Array = field(init=False)
     blur_px2: Array = field(init=False)
     drop_clipped: bool = False
-    #: For one model and capture; a fit changes one element at a time.
+    #: Shared by all changes of one model and capture: a fit changes one element at a time.
     built: Built | None = None
 
     def __post_init__(self) -> None:
@@ -188,7 +186,10 @@ class Changes:
         return new
 
     def once(self, what: str, elements: Sequence[str], kinds: Sequence[str], make: Callable[[], Array]) -> Array:
-        """What `make` returns, unless these kinds of changes of its elements were the same before."""
+        """The array of `make`. It is made anew only if these kinds of changes of its elements are new.
+
+        `what` names the array: an element for its matrices (N, 4, 4), or a train for its vectors.
+        """
         if self.built is None:
             return make()
         changes = [vars(self)[kind] for kind in kinds]

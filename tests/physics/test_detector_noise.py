@@ -136,7 +136,7 @@ def test_a_correlation_of_neighbours_is_as_uncertain_as_bright_pixels_are_few():
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_noise_of_few_bright_pixels_beside_dark_ones_is_no_structure(seed):
-    """A bright stripe, a sixth of the image: its noise goes together in the pixels of the whole no more than chance."""
+    """A bright stripe on a sixth of the image has most of the noise, which its pixels share by chance alone."""
     random, states, side = np.random.default_rng(seed), 64, 27
     light = np.where(np.arange(side) // 4 == 3, 0.5, 0.005)
     rows = random.normal(size=(states, 4)) + 2

@@ -112,7 +112,7 @@ def test_pixels_at_the_rim_alone_are_an_error_in_words(configs, tmp_path):
     model, data = captured(tmp_path, configs, TrueBench(rows=SIDE, columns=SIDE))
     rim = np.ones((SIDE, SIDE), dtype=bool)
     rim[2:-2, 2:-2] = False
-    with pytest.raises(CaptureError, match="no pixel is bright"):
+    with pytest.raises(CaptureError, match="no pixel is at once bright"):
         InstrumentProblem(model, [replace(data, usable=rim)])
 
 

@@ -13,7 +13,7 @@ from processing.arrays import Array
 from processing.diagnosis.captures.binning import MOST_FITTED
 from processing.diagnosis.captures.black_jitter import black_jitter
 from processing.diagnosis.captures.capture_data import CaptureData, SharedNoise, mixed_part
-from processing.diagnosis.captures.outliers import Whitened
+from processing.diagnosis.captures.outliers import Whitened, count_equal
 from processing.diagnosis.search.range_of import NEARLY_ZERO
 from processing.diagnosis.search.rules import (
     DARK_NOISE_OFF,
@@ -78,9 +78,8 @@ def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
     part = slice((height - rows) // 2, (height - rows) // 2 + rows)
     looked_at = np.zeros(data.usable.shape, dtype=bool)
     looked_at[part] = (data.usable & ~data.clipped)[part]
-    # Bright pixels have most of the noise, and count as the number of equal ones that scatters as much.
-    weight = data.variance(looked_at).sum(axis=(0, 1), dtype=float)
-    if weight.sum() ** 2 <= FEWEST_OF_MANY * np.sum(weight**2):
+    # Bright pixels have most of the noise: few of them beside many dark ones do not show it.
+    if count_equal(data.variance(looked_at).sum(axis=(0, 1), dtype=float)) <= FEWEST_OF_MANY:
         return None
     white = Whitened.of(data, a, looked_at)
     if white.outside.shape[1] < FEWEST_FREE:

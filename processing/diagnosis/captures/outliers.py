@@ -93,17 +93,17 @@ class Whitened:
         inner = (outside.T @ np.clip(r, -LIMIT * scale, LIMIT * scale, out=r)).astype(float)
         value, vector = np.linalg.eigh(inner @ inner.T / inner.shape[1])
         # Largest eigenvalue of noise over the median one (Marchenko and Pastur); beyond it all pixels share structure.
-        # Bright pixels beside dark ones have most of the noise, and so few equal ones would scatter as much.
-        edge = GROWTH * (1 + np.sqrt(len(value) / _count_equal(variance.mean(axis=0, dtype=float)))) ** 2
+        # Of bright pixels beside dark ones only the bright ones count, as they have most of the noise.
+        edge = GROWTH * (1 + np.sqrt(len(value) / count_equal(variance.mean(axis=0, dtype=float)))) ** 2
         # At least half of the directions are left to tell what noise is.
         half = len(value) // 2
         structure = self.outside @ vector[:, half:][:, value[half:] > edge * np.median(value)]
         return np.asarray(self.outside @ self.outside.T - structure @ structure.T)
 
 
-def _count_equal(weight: Array) -> float:
-    """How many parts of equal weight have a sum that scatters as one of parts of these weights (P,)."""
-    return float(weight.sum() ** 2 / np.sum(weight**2))
+def count_equal(variance: Array) -> float:
+    """Number of pixels of equal variance whose mean square scatters as that of pixels of these variances (P,)."""
+    return float(variance.sum() ** 2 / max(float(np.sum(variance**2)), 1e-300))
 
 
 def robust_scale(r: NDArray[np.floating]) -> Array:

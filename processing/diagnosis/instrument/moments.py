@@ -134,7 +134,7 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     pixels, channels = Pixels(data), data.signal.shape[1]
     if not pixels.good.any():
         raise CaptureError(
-            f"{data.name}: no pixel is bright, away from sharp edges and {MARGIN} pixels from the rim of the image. "
+            f"{data.name}: no pixel is at once bright, away from sharp edges, and {MARGIN} pixels off the image's rim. "
             "Take a larger region of the camera, or one that the sample fills."
         )
     means = pixels.means()

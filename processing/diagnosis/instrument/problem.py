@@ -388,6 +388,7 @@ class InstrumentProblem:
         da, dc = np.zeros((0, *a.shape)), None
         if derivatives:
             da, dc = self.slopes(k, space, values, a, c=c, columns=partial(self._columns_of_one_source, k))
+        # Blocks of the same pixels have the same features.
         together: dict[int, list[Block]] = {}
         for block in self.moments[k].blocks:
             if block.clipped and changes.drop_clipped:

@@ -29,12 +29,13 @@ class NoiseOfParts:
 
     Attributes
     ----------
+    free : (T, L) diagonal of the projection P.
     of_features : (T, F, L) mean product of the residual's noise with that of each feature, as it reaches each row.
     """
 
-    def __init__(self, noise: Array, q: Array, free: Array, c: Array, *, around: NDArray[np.bool_]) -> None:
-        """noise (T, L, F, F), q (T, L, K), diagonal of P (T, L), c (T or 1, F, L); `around` (F,): the derivatives."""
-        self._noise, self._q, self._free = noise, q, free
+    def __init__(self, noise: Array, q: Array, c: Array, *, around: NDArray[np.bool_]) -> None:
+        """noise (T, L, F, F), q (T, L, K), c (T or 1, F, L); `around` (F,): which features are derivatives."""
+        self._noise, self._q, self.free = noise, q, 1 - np.sum(q * q, axis=2)
         self._plain, self._around = np.flatnonzero(~around), np.flatnonzero(around)
         self._moving = self._around[np.any(c[:, self._around], axis=(0, 2))]
         self._c = c.swapaxes(1, 2)
@@ -43,7 +44,7 @@ class NoiseOfParts:
         self.of_features = self._of_features().swapaxes(1, 2)
 
     def _of_features(self) -> Array:
-        noise_of = np.asarray(self._free[..., None] * self._joined)
+        noise_of = np.asarray(self.free[..., None] * self._joined)
         if not self._around.size:
             return noise_of
         hat = self._q @ self._q.transpose(0, 2, 1)
@@ -87,11 +88,12 @@ def fitted(q: Array, x: Array) -> Array:
 
 
 def _off(q: Array, x: Array) -> Array:
-    """(1 - Q Q^T) x of the same."""
+    """P x (..., L, R) of the same, with P = 1 - Q Q^T."""
     return np.asarray(x - fitted(q, x))
 
 
 def _outside(hat: Array) -> Array:
+    """P (..., L, L) of H = Q Q^T (..., L, L)."""
     return np.asarray(np.eye(hat.shape[-1]) - hat)
 
 
@@ -203,6 +205,7 @@ class Projected:
     ----------
     free : (T, L) diagonal of the projection P; residual : (T, L, R) P y; expected : (T,) squares of noise alone.
     unknowns : (T, R, K) A+ y, turned over.
+    of_features : (T, F, L) see `NoiseOfParts`.
     """
 
     def __init__(self, z: Array, noise: Array, a: Array, c: Array, *, around: NDArray[np.bool_]) -> None:
@@ -212,15 +215,14 @@ class Projected:
         q = u * keep[:, None, :]
         # A+, turned over.
         self._back = q * np.where(keep, 1 / np.maximum(size, 1e-300), 0.0)[:, None, :] @ vt
-        self._q, self.free = q, 1 - np.sum(q * q, axis=2)
-        self._noise = NoiseOfParts(noise, q, self.free, c, around=around)
-        self._z = z
+        self._q, self._z = q, z
+        self._noise = NoiseOfParts(noise, q, c, around=around)
+        self.free, self.of_features = self._noise.free, self._noise.of_features
         if around.any():
             self._z = z.copy()
             self._z[:, around] = fitted(q[:, None], z[:, around])
         y = np.einsum("tfl,tflr->tlr", c, self._z)
         self.residual, self.unknowns = _off(q, y), y.transpose(0, 2, 1) @ self._back
-        self.of_features = self._noise.of_features
         self.expected = np.sum(c * self.of_features, axis=(1, 2))
 
     @cached_property

@@ -128,19 +128,21 @@ class _Fits:
 
         Where a path comes to a place that was reached before, it goes on as the one that reached it did.
         """
-        paths, reached = [[self.at(start)] for start in starts], list[Array]()
-        going = paths
+        paths, places = [[self.at(start)] for start in starts], list[Array]()
+        open_paths = paths
         for _ in range(ROUNDS):
-            still = []
-            for path in going:
-                path.append(train := self._step(path[-1]))
-                if not any(np.all(np.abs(train.values - x) < LITTLE * self._typical) for x in reached):
-                    still.append(path)
-                reached.append(train.values)
-            going = still
+            trains = [self._step(path[-1]) for path in open_paths]
+            ahead = []
+            for path, train in zip(open_paths, trains, strict=True):
+                path.append(train)
+                if not any(np.all(np.abs(train.values - x) < LITTLE * self._typical) for x in places):
+                    ahead.append(path)
+                places.append(train.values)
+            open_paths = ahead
         return [_best(path) for path in paths]
 
     def _step(self, train: Train) -> Train:
+        """The train one step of reweighted least squares further."""
         weak = 2 * train.unit / (self._typical**2 + train.values**2)
         fit = minimize(self.problem, self.space, train.values, weak=weak, unit=train.unit, expansions=0)
         return self.at(fit.values)

@@ -19,7 +19,7 @@ from processing.diagnosis.search.space import Problem, Space, Sums
 LEAST_FREEDOM = 0.2
 #: [steps] Of a fit.
 STEPS = 15
-#: [unit of chi-square] The fit ends when a step gains less than this.
+#: [unit of chi-square, see `minimize`] The fit ends when a step gains less than this.
 LEAST_GAIN = 0.05
 
 
@@ -58,7 +58,7 @@ def minimize(
     """Least chi-square over its stretch by Levenberg-Marquardt with bounds, on the data of the folds given.
 
     `weak` (K,) is the curvature of the prior; default: `prior`. Some values may be held, others are `free` (K,).
-    The fit ends when a step gains little, in units of chi-square of so much (`unit`).
+    `unit` is the chi-square of one independent direction: the fit ends when a step gains 5 % of it or less.
     Corrections of counts are expanded about the start, and at most `expansions` times anew about where the fit ended.
     `at_start`: the sums at the start, if they are known. Those of the fit may be without derivatives.
     """
@@ -94,8 +94,8 @@ def _descend(
     cost = _penalize(sums, weak, x, use, reference=reference)
     for _ in range(steps):
         # A bend of the response stretches residual and noise alike, which is no gain.
-        stretched = sums.excess[use].sum() / max(float(sums.freedom[use].sum()), 1e-300)
-        g = sums.gradient[use].sum(axis=0) - stretched * sums.stretch[use].sum(axis=0) + weak * x
+        reduced = sums.excess[use].sum() / max(float(sums.freedom[use].sum()), 1e-300)
+        g = sums.gradient[use].sum(axis=0) - reduced * sums.stretch[use].sum(axis=0) + weak * x
         h = sums.curvature[use].sum(axis=0) + np.diag(weak)
         if not free.any():
             break

@@ -156,8 +156,6 @@ class Sets:
         sizes = np.array([g.index.size for g in groups])
         self.tau_weight = np.where((sizes >= MANY)[:, None], TAU_WEIGHT_OF_MANY, TAU_WEIGHT)
         self.tau_weight[np.array([g.far for g in groups], dtype=bool)] = TAU_WEIGHT_OF_FAR
-        #: Values that were asked for last, and their curvature: often the unit alone is another one.
-        self._last = np.zeros(0, dtype=np.int64), np.zeros((0, 0))
         #: Groups of one size, where their values stand (G, n), and the curvature (G, n, n) of each.
         self._alike: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
         for n in np.unique(sizes):
@@ -254,9 +252,7 @@ class Sets:
         on, u = np.flatnonzero(state.tau > 0), state.unit
         active = np.concatenate([np.zeros(0, dtype=np.int64), *(self.groups[i].index for i in on)])
         prior = np.concatenate([np.zeros(0), *(np.full(self.groups[i].index.size, state.tau[i] ** -2.0) for i in on)])
-        if not np.array_equal(active, self._last[0]):
-            self._last = active, self.form.curvature[np.ix_(active, active)]
-        curvature = self._last[1] / u
+        curvature = self.form.curvature[np.ix_(active, active)] / u
         curvature.flat[:: active.size + 1] += prior
         lower = _root(curvature)
         # As `solve_triangular` does it, which takes twenty times as long to find that out.
