@@ -9,16 +9,16 @@ of the counts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
-from itertools import accumulate
 
 import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.captures.capture_data import CaptureData
+from processing.diagnosis.instrument.capture_changes import CaptureChanges
 from processing.diagnosis.instrument.features import FEATURES
 from processing.diagnosis.instrument.moments import Block, Moments, folds_of, moments_of
 from processing.diagnosis.instrument.photon_noise import (
@@ -34,10 +34,10 @@ from processing.diagnosis.instrument.slopes import Columns, slopes_of_counts, sl
 from processing.diagnosis.instrument.tiles import add_tiles, slopes_of_tiles, tile_columns
 from processing.diagnosis.search.candidate import Candidate, SourceLevel, nominal_values, pool
 from processing.diagnosis.search.range_of import range_of
-from processing.diagnosis.search.rules import EXACT, KEPT
+from processing.diagnosis.search.rules import EXACT
 from processing.diagnosis.search.space import Space, Sums
 from processing.instrument.applied_effects import changes_of
-from processing.instrument.changes import Built, Changes
+from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
 
 #: [points] Of expansion that are kept besides the first: each has counts of its own.
@@ -174,8 +174,8 @@ class InstrumentProblem:
     def forget_linearizations(self) -> None:
         """Drop what was built for another model or other states; the moments of the counts stay."""
         self._others: list[InstrumentProblem] = []
-        self._built: list[Built] = [{} for _ in self.captures]
-        self._asked: list[dict[tuple[str, str, bytes], Changes]] = [{} for _ in self.captures]
+        parts = enumerate(zip(self.models, self.captures, self.own_px, strict=True))
+        self._changes = [CaptureChanges(k, model, data, px * data.pitch) for k, (model, data, px) in parts]
 
     def with_models(self, models: Sequence[InstrumentModel]) -> InstrumentProblem:
         """The same captures against other models of the same instrument."""
@@ -225,33 +225,7 @@ class InstrumentProblem:
 
     def changes(self, capture: int, space: Space, values: Array) -> Changes:
         """Changes of one capture with the instrument's own effects and the active candidates."""
-        data = self.captures[capture]
-        built = self._built[capture]
-        if len(built) > KEPT:
-            built.clear()
-        changes = Changes(data.conditions, built=built)
-        changes.add(self._changes_of(capture, None, np.zeros(0)))
-        # At zero an effect does nothing: there is no need to ask it.
-        for candidate, part in space.other_than_zero(values):
-            if candidate.acts(capture, data.wavelength_nm):
-                changes.add(self._changes_of(capture, candidate, part))
-        return changes
-
-    def _changes_of(self, capture: int, candidate: Candidate | None, values: Array) -> Changes:
-        """Changes of one capture by one candidate alone, not to be altered; None: by the instrument's own effects."""
-        cache, model, data = self._asked[capture], self.models[capture], self.captures[capture]
-        name = (candidate.kind, candidate.place) if candidate else ("", "")
-        key = (*name, values.tobytes())
-        if key not in cache:
-            if len(cache) > KEPT:
-                cache.clear()
-            changes = Changes(data.conditions) if candidate else changes_of(model, data.conditions, data.name)
-            if candidate:
-                candidate.apply(changes, model, values)
-            elif self.own_px[capture].any():
-                changes.shift_px = changes.shift_px - self.own_px[capture] * data.pitch
-            cache[key] = changes
-        return cache[key]
+        return self._changes[capture].of(space, values)
 
     @property
     def held_out(self) -> str:
@@ -408,42 +382,15 @@ class InstrumentProblem:
 
         Each with one more axis in front, the values; `columns` makes the rows of changes.
         """
-        conditions, changes = self.captures[k].conditions, self._changes_about(k, space, values)
+        conditions, changes = self.captures[k].conditions, self._changes[k].about(space, values)
         da = slopes_of_rows(changes, self.models[k], conditions, space, values=values, a=a, columns=columns)
         return da, slopes_of_counts(changes, partial(self.coefficients, k), space, values, c=c)
-
-    def _changes_about(self, k: int, space: Space, values: Array) -> Callable[[Array], Changes]:
-        """Changes of values of which those of one candidate differ: all before it and behind it are joined once."""
-        none, built = Changes(self.captures[k].conditions), self._built[k]
-
-        def joined(*parts: Changes) -> Changes:
-            first, *others = [part for part in parts if part is not none] or [none]
-            if not others:
-                return first
-            total = first.copied(built)
-            for part in others:
-                total.add(part)
-            return total
-
-        pairs = space.pairs
-        each = [self._changes_of(k, c, values[p]) if values[p].any() else none for c, p in pairs]
-        before = list(accumulate([self._changes_of(k, None, np.zeros(0)), *each], joined))
-        behind = list(accumulate([none, *reversed(each)], lambda later, part: joined(part, later)))[::-1]
-
-        def changes(moved: Array) -> Changes:
-            differ = np.flatnonzero(moved != values)
-            if not differ.size:
-                return before[-1].copied(built)
-            i = space.owner(int(differ[0]))
-            return joined(before[i], self._changes_of(k, pairs[i][0], moved[pairs[i][1]]), behind[i + 1])
-
-        return changes
 
     def slopes_of_counts(self, k: int, space: Space, values: Array, c: Array) -> Array:
         """Derivatives (values, F, L) of the coefficients c (F, L) of the corrected counts of a capture."""
         if not any(candidate.acts_on_counts for candidate in space.candidates):
             return np.zeros((space.size, *c.shape))
-        changes = self._changes_about(k, space, values)
+        changes = self._changes[k].about(space, values)
         return slopes_of_counts(changes, partial(self.coefficients, k), space, values, c=c)
 
     def _tile_sums(
