@@ -97,6 +97,8 @@ def words_of(entry: Any, names: Sequence[str] = ()) -> str:
     names : keys that a file may have; the nearest one is named beside one that it may not have.
     """
     kind = str(entry["type"])
+    if "words" in entry.get("ctx", {}):
+        return str(entry["msg"])
     if kind == "extra_forbidden":
         key = str(entry["loc"][-1])
         meant = get_close_matches(key, [name for name in names if name != key], 1, cutoff=0.75)

@@ -9,7 +9,7 @@ from pydantic import ModelWrapValidatorHandler, TypeAdapter, ValidationError, mo
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from acquisition.rig.sections import AxisEntry, RigSections
-from acquisition.rig.soundness import Mistake, find_mistakes
+from acquisition.rig.soundness import find_mistakes
 from drivers.clock import REAL, Clock
 from processing.yaml_file import ConfigError, load_yaml
 from processing.yaml_words import mistakes_of, names_in, words_of
@@ -32,7 +32,7 @@ class RigConfig(RigSections):
     @classmethod
     def _report_all_mistakes(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         # References between sections are checked even if a section cannot be read.
-        mistakes: list[Mistake] = []
+        mistakes: list[tuple[tuple[int | str, ...], str, str]] = []
         rig: RigConfig
         try:
             rig = valid = handler(data)
@@ -40,10 +40,10 @@ class RigConfig(RigSections):
             if not isinstance(data, dict):
                 raise
             rig, valid = _readable(data), None
-            mistakes = [(entry["loc"], words_of(entry, names_in(cls))) for entry in mistakes_of(error)]
-        mistakes += find_mistakes(rig)
+            mistakes = [(e["loc"], words_of(e, names_in(cls)), e["type"]) for e in mistakes_of(error)]
+        mistakes += [(where, why, "rig") for where, why in find_mistakes(rig)]
         if valid is None or mistakes:
-            raise ValidationError.from_exception_data(cls.__name__, [_details(where, why) for where, why in mistakes])
+            raise ValidationError.from_exception_data(cls.__name__, [_details(*mistake) for mistake in mistakes])
         return valid
 
     def named_states(self) -> dict[str, Mapping[str, float]]:
@@ -112,8 +112,10 @@ def _readable(data: dict[str, Any]) -> RigConfig:
     return RigConfig.model_construct(**sections)
 
 
-def _details(where: tuple[int | str, ...], why: str) -> InitErrorDetails:
-    return InitErrorDetails(type=PydanticCustomError("rig", "{why}", {"why": why}), loc=where, input=None)
+def _details(where: tuple[int | str, ...], why: str, kind: str) -> InitErrorDetails:
+    """A mistake in words that stay as they are; its kind says whether its place stands in the file."""
+    words = PydanticCustomError(kind, "{words}", {"words": why})
+    return InitErrorDetails(type=words, loc=where, input=None)
 
 
 def load_rig(path: Path | str) -> RigConfig:

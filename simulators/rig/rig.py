@@ -64,8 +64,12 @@ class SimulatedRig:
             for text in port.faults:
                 self.emulators[name].faults.add(parse_fault(text))
         for name, axis in self.config.axes.items():
-            if axis.port not in self.emulators or axis.index >= len(self.emulators[axis.port].axes):
-                raise ConfigError(f"simulator.axes.{name}: there is no axis {axis.index} at port {axis.port!r}")
+            count = len(self.emulators[axis.port].axes) if axis.port in self.emulators else 0
+            if axis.index >= count:
+                raise ConfigError(
+                    f"simulator.axes.{name}: port {axis.port!r} has no axis of index {axis.index} (from 0; axes there: "
+                    f"{count}). Correct `index`, or `axes` of the port under `simulator.ports`."
+                )
         if self._with_camera:
             self._start_camera()
 

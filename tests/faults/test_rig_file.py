@@ -1,6 +1,8 @@
 """Promise 18: a rig file that cannot be meant is refused before anything opens, with every mistake at once."""
 
+import functools
 import math
+import operator
 import re
 
 import numpy as np
@@ -16,7 +18,7 @@ from acquisition.rig.config import load_rig
 from acquisition.rig.open_rig import open_rig
 from acquisition.rig.solids import Solids
 from processing.yaml_file import ConfigError
-from tests.rig_files import with_values
+from tests.rig_files import change_yaml, with_values
 
 ZABER = {"kind": "zaber", "port": "sim:rotators"}
 
@@ -101,6 +103,17 @@ def test_what_cannot_be_meant_is_refused(changed, name):
         assert word in str(refused.value), refused.value
     # File and line in front of every mistake.
     assert all(re.match(r".*rig\.yaml:\d+: ", line) for line in str(refused.value).splitlines())
+
+
+@pytest.mark.parametrize("key", ["name", "camera", "axes.arm.port", "modes.drr.instrument", "simulator.axes.psa.port"])
+def test_what_is_missing_is_named(configs, tmp_path, key):
+    def without(tree):
+        *above, last = key.split(".")
+        del functools.reduce(operator.getitem, above, tree)[last]
+
+    file = change_yaml(configs / "rigs" / "simulated.yaml", without, tmp_path / "rig.yaml")
+    with pytest.raises(ConfigError, match=rf"rig\.yaml:\d+: {re.escape(key)}: is missing"):
+        load_rig(file)
 
 
 def test_a_transcript_needs_a_folder(changed, tmp_path):
