@@ -14,7 +14,7 @@ from acquisition.rig.config import RigConfig
 from acquisition.screen.observer import Observer
 from acquisition.taking import take_capture
 from processing.diagnosis.instrument.diagnose import Judged, diagnose_captures
-from processing.diagnosis.instrument.report import write_report
+from processing.diagnosis.instrument.figures import write_report
 from processing.diagnosis.instrument_file import write_instrument
 from processing.diagnosis.search.result import FoundEffect
 from processing.instrument.model import InstrumentModel

@@ -59,7 +59,7 @@ def diagnose_command(
     if json is not None:
         write_result(json, judged.diagnosis)
     if report is not None:
-        from processing.diagnosis.instrument.report import write_report
+        from processing.diagnosis.instrument.figures import write_report
 
         write_report(report, judged, problem)
     if residuals is not None:

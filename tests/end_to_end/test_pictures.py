@@ -64,7 +64,7 @@ def test_the_page_of_a_product_opens_on_what_it_is_about(xi0_product):
 
 
 def test_squares_of_pixels_show_what_the_noise_of_single_pixels_hides():
-    from processing.diagnosis.instrument.report import _cells, _noise_of_cells
+    from processing.diagnosis.instrument.figures import _cells, _noise_of_cells
 
     rng = np.random.default_rng(5)
     image = rng.normal(0, 1, (6, 200, 240)) + 0.3 * np.sin(np.arange(240) / 40)

@@ -24,7 +24,7 @@ def campaign(quick_rig, configs, tmp_path, acquire):
 
     copy = home.with_name(home.name + " as it was")
     if copy.exists():
-        shutil.rmtree(home)
+        shutil.rmtree(home, ignore_errors=True)
         shutil.copytree(copy, home)
         return run, rig, plan, home / "night"
     text = (configs / "plans" / "drr.yaml").read_text()

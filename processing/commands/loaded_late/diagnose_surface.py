@@ -46,7 +46,7 @@ def diagnose_reflectance(
     if json is not None:
         write_result(json, judged.diagnosis)
     if report is not None:
-        from processing.diagnosis.surface.report import write_surface_report
+        from processing.diagnosis.surface.figures import write_surface_report
 
         write_surface_report(report, judged, problem)
         files.append(report)
