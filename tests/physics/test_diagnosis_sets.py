@@ -24,6 +24,8 @@ from processing.instrument.effects.rotation_slip import RotationSlip
 
 #: Nothing but noise, whose unit is one.
 QUIET = Noise(is_known=True, directions=30.0, slack=1e9)
+#: Absent, and the standard deviations that are possible at all.
+WIDTHS = [0.0, *TAU[TAU_WEIGHT > 0]]
 
 
 def form(design, truth, seed=0):
@@ -44,7 +46,7 @@ def test_probabilities_are_those_of_all_sets():
     design[:, 1] = design[:, 0] + 0.3 * random.standard_normal(40)
     sets = Sets(form(design, np.array([0.5, 0, 1.0, 0, 0.2])), groups(1, 1, 1, 2), QUIET)
     scores, presence = [], []
-    for tau in product([0.0, *TAU], repeat=4):
+    for tau in product(WIDTHS, repeat=4):
         scores.append(sets.fitted(State(np.array(tau))).score)
         presence.append(np.array(tau) > 0)
     weight = np.exp(np.array(scores) - max(scores))
@@ -63,7 +65,7 @@ def test_where_the_noise_is_unknown_it_is_one_of_the_unknowns():
     data = 20 * (design @ np.array([0.25, -0.2]) + random.standard_normal(12))
     problem = Quadratic(float(data @ data), -20 * design.T @ data, 400 * design.T @ design)
     sets = Sets(problem, groups(1, 1), Noise(is_known=False, directions=12.0, floor=1e-3))
-    states = [State(np.array(tau), u) for tau in product([0.0, *TAU], repeat=2) for u in np.geomspace(20, 2e4, 30)]
+    states = [State(np.array(tau), u) for tau in product(WIDTHS, repeat=2) for u in np.geomspace(20, 2e4, 30)]
     scores = np.array([sets.score(state) for state in states])
     weight = np.exp(scores - scores.max())
     weight /= weight.sum()
@@ -117,7 +119,7 @@ def test_the_chance_of_a_worse_result_is_that_of_all_sets():
     sets = Sets(problem, groups(1, 1), QUIET)
     samples = stay(sets, likely_starts(sets, likely_set(sets)), 1000)
     random, ones, correction = np.random.default_rng(3), np.ones((2, 2)), np.array([samples.mean[0], 0.0])
-    states = [State(np.array(tau)) for tau in product([0.0, *TAU], repeat=2)]
+    states = [State(np.array(tau)) for tau in product(WIDTHS, repeat=2)]
     scores = np.array([sets.score(state) for state in states])
     weight = np.exp(scores - scores.max())
     fits, grew = [sets.fitted(state) for state in states], []
@@ -137,7 +139,7 @@ def test_one_cause_that_does_what_two_do_has_its_share_from_either_side():
     design = np.hstack([half, half])
     causes = [*(Group(g.index, price=5.5) for g in groups(2, 2)), Group(np.arange(4, 8), price=12.0)]
     sets = Sets(form(design, np.array([0.5, -0.4, 0.3, 0.5, 0, 0, 0, 0]), 2), causes, QUIET)
-    taus = np.array(list(product([0.0, *TAU], repeat=3)))
+    taus = np.array(list(product(WIDTHS, repeat=3)))
     scores = np.array([sets.fitted(State(tau)).score for tau in taus])
     weight = np.exp(scores - scores.max())
     exact = float(weight @ (taus[:, 2] > 0) / weight.sum())

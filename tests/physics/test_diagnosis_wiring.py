@@ -27,25 +27,29 @@ def diagnosed(tried):
         return diagnose(tried, lambda line: None).diagnosis
 
 
-@pytest.mark.parametrize("air", [True, False])
+#: What a file tells of its angles, what the message says of it, and the samples whose test is not long.
+MISTAKES = (
+    (lambda a: a | {"psa": -a["psa"]}, "'psa' turns the other way", ["air"]),
+    (lambda a: {"psg": a["psa"], "psa": a["psg"]}, "each other's place", ["unknown"]),
+    (lambda a: a | {"psg": 2 * a["psg"]}, "'psg' are told in half degrees", []),
+    (lambda a: {k: 2 * v for k, v in a.items()}, "'psa' and 'psg' are told in half degrees", ["unknown"]),
+    (lambda a: {k: v / 2 for k, v in a.items()}, "'psa' and 'psg' are told in units of two degrees", []),
+    (lambda a: a | {"psa": a["psa"] * 4.91 / 5}, "5 instead of 4.91", ["air"]),
+    (lambda a: {k: np.roll(v, 1) for k, v in a.items()}, "one early", ["unknown"]),
+)
+
+
 @pytest.mark.parametrize(
-    ("report_angles", "word"),
+    ("report_angles", "word", "sample"),
     [
-        (lambda a: a | {"psa": -a["psa"]}, "'psa' turns the other way"),
-        (lambda a: {"psg": a["psa"], "psa": a["psg"]}, "each other's place"),
-        pytest.param(lambda a: a | {"psg": 2 * a["psg"]}, "'psg' are told in half degrees", marks=pytest.mark.long),
-        (lambda a: {k: 2 * v for k, v in a.items()}, "'psa' and 'psg' are told in half degrees"),
-        pytest.param(
-            lambda a: {k: v / 2 for k, v in a.items()},
-            "'psa' and 'psg' are told in units of two degrees",
-            marks=pytest.mark.long,
-        ),
-        (lambda a: a | {"psa": a["psa"] * 4.91 / 5}, "5 instead of 4.91"),
-        (lambda a: {k: np.roll(v, 1) for k, v in a.items()}, "one early"),
+        pytest.param(angles, word, sample, marks=[] if sample in short else pytest.mark.long, id=f"{word}-{sample}")
+        for angles, word, short in MISTAKES
+        for sample in ("air", "unknown")
     ],
 )
-def test_a_mistake_is_told(configs, tmp_path, report_angles, word, air):
+def test_a_mistake_is_told(configs, tmp_path, report_angles, word, sample):
     # Beside small faults of the optics, which are no mistake.
+    air = sample == "air"
     bench = TrueBench(dg=np.deg2rad(128.0), lp=np.deg2rad(-0.2))
     mistake = likeliest_arrangement(problem(tmp_path, configs, bench, report_angles, air))
     assert mistake.message is not None
@@ -109,9 +113,9 @@ def test_the_filter_of_another_wavelength_is_told(configs, tmp_path, air):
 @pytest.mark.parametrize(
     ("fault", "kind", "degrees"),
     [
-        ({"oa": 13.41 + 28.0}, "psa_azimuth", 28.0),
+        pytest.param({"oa": 13.41 + 28.0}, "psa_azimuth", 28.0, marks=pytest.mark.long),
         ({"dg": 127.12 - 47.0, "oa": 13.41 + 4.5}, "psg_retardance", -47.0),
-        ({"lp": -0.53 - 53.0}, "analyzer_azimuth", -53.0),
+        pytest.param({"lp": -0.53 - 53.0}, "analyzer_azimuth", -53.0, marks=pytest.mark.long),
     ],
 )
 def test_a_plate_that_is_far_off_is_found_in_air(configs, tmp_path, fault, kind, degrees):

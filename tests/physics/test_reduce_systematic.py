@@ -59,7 +59,7 @@ def test_the_error_is_what_one_standard_deviation_does(air, configs, tmp_path):
         # The next sample of `test_instrument_chain.py` says the same.
         pytest.param((), True, True, marks=pytest.mark.long),
         ((), False, False),
-        (("psg_retarder.retardance_deg",), False, True),
+        pytest.param(("psg_retarder.retardance_deg",), False, True, marks=pytest.mark.long),
     ],
 )
 def test_what_is_not_corrected_in_a_later_capture_is_in_its_error_bar(
