@@ -28,7 +28,7 @@ class DemosaicingMethod:
 
     Attributes
     ----------
-    name, title : as in commands and lists.
+    name : as in commands and lists.
     channels : of a float32 frame (rows, columns), images (channels, rows, columns) float32.
     reach : pixels from which a value is taken lie within this distance; next to an edge they mix both sides.
     linear : the weights of the raw pixels do not depend on the frame.
@@ -36,7 +36,6 @@ class DemosaicingMethod:
     """
 
     name: str
-    title: str
     channels: Callable[[Image, MosaicLayout], NDArray[np.float32]]
     reach: int
     linear: bool
@@ -65,9 +64,8 @@ def _method(name: str, module: ModuleType) -> DemosaicingMethod:
         raise MosaicError(
             f"{module.__name__} is no demosaicing method: it needs a docstring, REACH and channels(frame, layout)"
         )
-    title = module.__doc__.splitlines()[0].rstrip(".")
     linear, covariance = getattr(module, "LINEAR", False), getattr(module, "covariance", None)
-    return DemosaicingMethod(name, title, module.channels, module.REACH, linear, covariance)
+    return DemosaicingMethod(name, module.channels, module.REACH, linear, covariance)
 
 
 def method_of(name: str) -> DemosaicingMethod:
