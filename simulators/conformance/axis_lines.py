@@ -21,7 +21,7 @@ class SharedLineConformance(AxisTests):
     def test_two_axes_on_one_line_move_at_once(self, kind: str) -> None:
         with self.served(kind, speed=2.0, axes=2) as served:
             places = {config.place() for config in served.configs}
-            assert len(places) == len(served.configs), "Config.place() tells axes of one line apart: no rig file has both"
+            assert len(places) == len(served.configs), "Config.place() tells axes of one line apart"
             first, second = served.open(0), served.open(1)
             motions = [first.start_move(150.0), second.start_move(-150.0)]
             assert first.is_moving()
