@@ -199,7 +199,7 @@ class Library:
         try:
             if not _is_utf8(common["name"]):
                 raise ProcessError("its name is not UTF-8, so no page can ask for it; give it another")
-            entry = _read(path, common)
+            entry = read_entry(path, common)
         except ProcessError as error:
             entry = Entry(**common, kind="unreadable", status="failed", flags=(str(error),))
         # HDF5 answers for a file that another page has open with what it was then; its end changes neither size nor,
@@ -211,7 +211,8 @@ class Library:
         return entry
 
 
-def _read(path: Path, common: dict[str, Any]) -> Entry:
+def read_entry(path: Path, common: dict[str, Any]) -> Entry:
+    """The entry of a file, whatever it is, with the fields that all have in `common`."""
     if is_product(path):
         return _product(path, common)
     if is_table(path):

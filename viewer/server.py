@@ -37,7 +37,7 @@ def serve(folder: Path, port: int, browser: bool) -> None:
     # A browser that sends no request holds a connection; other requests need one more.
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (limit if limit != resource.RLIM_INFINITY else 1 << 16, limit))
-    way_in = _open_in_browser(address) if browser else None
+    way_in = open_in_browser(address) if browser else None
     # Addresses hold the token, so no request is ever logged.
     settings = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=1, lifespan="off")
     try:
@@ -47,7 +47,7 @@ def serve(folder: Path, port: int, browser: bool) -> None:
             way_in.unlink(missing_ok=True)
 
 
-def _open_in_browser(address: str) -> Path:
+def open_in_browser(address: str) -> Path:
     """Open the address by way of a page that this user alone can read: every user sees the words of a command."""
     with tempfile.NamedTemporaryFile("w", prefix="umov-view-", suffix=".html", delete=False) as file:
         file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={address}"><title>view</title>')

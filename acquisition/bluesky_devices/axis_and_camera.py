@@ -68,7 +68,7 @@ class CameraDevice(BlueskyDevice):
     tells_frames : False for the mean alone.
     """
 
-    _frame: np.ndarray[Any, np.dtype[np.uint16]]
+    frame: np.ndarray[Any, np.dtype[np.uint16]]
     _path: Path
     folder: Path | str | None = None
     exposure_s = 0.02
@@ -124,9 +124,9 @@ class CameraDevice(BlueskyDevice):
 
         def expose() -> None:
             with self.turn:
-                self._frame = self.rig.require_camera().capture(1)[0].pixels
+                self.frame = self.rig.require_camera().capture(1)[0].pixels
                 if self._writes_files:
-                    self._path = write_frame(Path(self.folder or ""), self.name, self._frame, self.exposure_s)
+                    self._path = write_frame(Path(self.folder or ""), self.name, self.frame, self.exposure_s)
 
         return in_background(expose)
 
@@ -137,8 +137,8 @@ class CameraDevice(BlueskyDevice):
     def read(self) -> Readings:
         """The frame that was taken last, unless it is in a file, and its mean in counts."""
         has_frame = self.tells_frames and not self._writes_files
-        frame = {f"{self.name}_frame": self._frame} if has_frame else {}
-        return readings(frame | {f"{self.name}_mean": float(self._frame.mean())})
+        frame = {f"{self.name}_frame": self.frame} if has_frame else {}
+        return readings(frame | {f"{self.name}_mean": float(self.frame.mean())})
 
     def describe(self) -> Readings:
         """Shapes and units."""
@@ -154,4 +154,4 @@ class CameraDevice(BlueskyDevice):
     def collect_asset_docs(self, index: int | None = None) -> Documents:
         """Where the frame that was taken last is."""
         if self._writes_files:
-            yield from asset_documents(f"{self.name}_frame", self._path, FRAME, (1, *self._frame.shape))
+            yield from asset_documents(f"{self.name}_frame", self._path, FRAME, (1, *self.frame.shape))

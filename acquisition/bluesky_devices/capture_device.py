@@ -64,8 +64,8 @@ class CaptureDevice(BlueskyDevice):
         self.plan, self.folder = plan, Path(folder)
         self._arm, self._interlock = arm, interlock
         self._home = home
-        self._job = prepare(plan, rig.config)
-        self._stop = StopRequest()
+        self.job = prepare(plan, rig.config)
+        self.stop_request = StopRequest()
         self._half: Path | None = None
         self._path: Path | None = None
         self._taking: MoveStatus | None = None
@@ -73,7 +73,7 @@ class CaptureDevice(BlueskyDevice):
 
     def trigger(self) -> MoveStatus:
         """Take the capture, or the states that are missing after a pause."""
-        self._stop = StopRequest()
+        self.stop_request = StopRequest()
         self._taking = in_background(self._take_or_pause)
         return self._taking
 
@@ -93,7 +93,7 @@ class CaptureDevice(BlueskyDevice):
                 result = self._run(session.resume, job_of(half, self.rig.config, self.plan), half)
             else:
                 with free_name(self.folder / default_name(self.plan)) as path:
-                    result = self._run(session.take, self._job, path)
+                    result = self._run(session.take, self.job, path)
         if result.status == "complete":
             self._half, self._path = None, result.path
             self._documents = list(self._asset_documents(result.path))
@@ -104,7 +104,7 @@ class CaptureDevice(BlueskyDevice):
         """Take the next captures with other values of the plan. Raises PlanRefused, ValidationError."""
         plan = MeasurementPlan.model_validate(self.plan.model_dump() | values)
         if plan != self.plan:
-            self._job = prepare(plan, self.rig.config)
+            self.job = prepare(plan, self.rig.config)
             self.plan = plan
 
     def setting(self, key: Literal["exposure_s", "wavelength_nm"]) -> SettingDevice:
@@ -147,7 +147,7 @@ class CaptureDevice(BlueskyDevice):
     def _run(self, run: Callable[..., Result], job: Job, path: Path) -> Result:
         refuse_failed(check_with_devices(job, self.rig, path.parent))
         try:
-            return run(job, self.rig, path, self._stop, home=self._home)
+            return run(job, self.rig, path, self.stop_request, home=self._home)
         except BaseException:
             # An existing partial file is resumed when the plan runs again.
             partial = path if path.name.endswith(PARTIAL) else path.with_name(path.name + PARTIAL)
@@ -157,14 +157,14 @@ class CaptureDevice(BlueskyDevice):
     def _await_pause(self) -> bool:
         """True if a suspender has seen the interlock too, and asks for a pause."""
         end_s = time.monotonic() + _SEEN_S
-        while self._interlock.is_watched and not self._stop.requested and time.monotonic() < end_s:
+        while self._interlock.is_watched and not self.stop_request.requested and time.monotonic() < end_s:
             time.sleep(0.01)
-        return self._stop.requested
+        return self.stop_request.requested
 
     def pause(self) -> None:
         """Finish the state that is being taken; called by the RunEngine."""
         if self._taking is not None and not self._taking.done:
-            self._stop.request()
+            self.stop_request.request()
             self._taking.exception(timeout=None)
 
     def resume(self) -> None:
@@ -172,7 +172,7 @@ class CaptureDevice(BlueskyDevice):
 
     def stop(self, *, success: bool = False) -> None:
         """End after the state that is being taken; `acquire --resume` continues the file."""
-        self._stop.request()
+        self.stop_request.request()
 
     def _column(self, axis: str) -> tuple[str, str]:
         return position_column(f"{self.name}_{axis}", self.rig.config.axes[axis].unit == "V")
@@ -192,9 +192,9 @@ class CaptureDevice(BlueskyDevice):
 
     def describe(self) -> Readings:
         """Shapes and units; the frames are (states, channels, rows, columns)."""
-        states = (len(self._job.table),)
+        states = (len(self.job.table),)
         keys = {f"{self.name}_file": {"source": "capture file", "dtype": "string", "shape": []}}
-        for axis in self._job.table.angles_deg:
+        for axis in self.job.table.angles_deg:
             name, unit = self._column(axis)
             keys[name] = data_key(f"axis {axis}, as read back in each state", states, unit)
         keys |= {f"{self.name}_{c}": data_key(c, states, COLUMN_UNITS.get(c, "")) for c in COLUMNS}

@@ -134,7 +134,7 @@ class CampaignRun:
                 if self._complete(capture, job):
                     self._catch_up(capture)
                     continue
-                result = self._take(capture, job)
+                result = self.take(capture, job)
                 if result is None or result.status == "aborted":
                     self.folder.log("campaign stopped", at=capture.name)
                     return False
@@ -154,7 +154,8 @@ class CampaignRun:
         finally:
             self._close_rig()
 
-    def _take(self, capture: CampaignCapture, job: Job) -> Result | None:
+    def take(self, capture: CampaignCapture, job: Job) -> Result | None:
+        """Take a capture, as often as the campaign retries it; None if it is given up."""
         failures = 0
         while True:
             if self.stop.requested:

@@ -221,7 +221,7 @@ class CaptureRunner:
         with self.ledger.time("moving"):
             positions = self.rig.wait(motions)
         self._pose_deg.update(changed)
-        self._set_light(self.table.role[state] != "dark")
+        self.set_light(self.table.role[state] != "dark")
         settle_s = self.rig.config.settle_s if changed else 0.0
         with self.ledger.time("settling"):
             self.rig.clock.sleep_s(settle_s)
@@ -323,7 +323,7 @@ class CaptureRunner:
         """Measure nothing while the disc takes nothing: the light is shut, and no further move begins."""
         if self.writer.is_settled():
             return
-        self._set_light(False)
+        self.set_light(False)
         self.warn("the disc takes no data: the light is shut until it does")
         self.writer.settle()
 
@@ -386,7 +386,8 @@ class CaptureRunner:
         # The shutter may have fallen with the interlock.
         self._light = None
 
-    def _set_light(self, on: bool) -> None:
+    def set_light(self, on: bool) -> None:
+        """Switch the light, unless it is known to be so; a light that may have been lost is switched again."""
         source = self.rig.source
         losses = self.rig.light_losses()
         if source is None or (self._light == on and losses == self._light_losses):

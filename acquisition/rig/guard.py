@@ -148,7 +148,7 @@ class Guard:
             return True
         if not self._has_shut and silent_s > (STOPPED_SHUT_S if is_frozen else SILENT_SHUT_S):
             # It may come back: only the light does not wait for that.
-            self._has_shut = self._try_light() is None
+            self._has_shut = self.try_light() is None
             if self._has_shut:
                 self.journal.note("light shut", why="acquire is silent")
                 self._say(line, shut="the guard heard nothing from acquire")
@@ -199,7 +199,7 @@ class Guard:
         is_dark = light.result() is None
         while not alarm.is_acknowledged():
             # A lamp that burns on is worth every further try.
-            if alarm.repeat() and not is_dark and self._try_light() is None:
+            if alarm.repeat() and not is_dark and self.try_light() is None:
                 is_dark = True
                 self.journal.note("light shut", why="tried again with the alarm")
                 alarm = GuardAlarm(self, f"{text}. The light has been shut since")
@@ -210,7 +210,7 @@ class Guard:
 
     # --- light -------------------------------------------------------------------------------------------
 
-    def _try_light(self) -> str | None:
+    def try_light(self) -> str | None:
         """Shut the light once; None, or why it is not shut."""
         problems = []
         with self._light_lock:
@@ -235,7 +235,7 @@ class Guard:
     def _shut_light(self) -> str | None:
         """Try for TRY_S; None once the light is shut, or what came back last."""
         begin_s = time.monotonic()
-        while (problem := self._try_light()) is not None:
+        while (problem := self.try_light()) is not None:
             if time.monotonic() - begin_s > TRY_S:
                 self.journal.note("LIGHT NOT SHUT", error=problem)
                 return problem

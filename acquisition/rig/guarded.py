@@ -60,14 +60,14 @@ class Guarding:
         *,
         tell: Callable[[str], None],
     ) -> None:
-        self._config, self._journal, self._ports = config, journal, ports
+        self._config, self.journal, self._ports = config, journal, ports
         self._shut, self._tell = shut, tell
         self.losses = 0
         self._hopeless: str | None = None
         self._is_dark_due = False
         self._watching = threading.Event()
         self._ended = threading.Event()
-        self._guard: subprocess.Popen[bytes] | None = None
+        self.process: subprocess.Popen[bytes] | None = None
         self._line: socket.socket | None = None
         self._tail = b""
         self._heart = threading.Thread(target=self._live, name="heartbeat", daemon=True)
@@ -100,7 +100,7 @@ class Guarding:
         self._ended.set()
         self._heart.join()
         self._say({"rest": True} if take_over is None else {"take_over": take_over})
-        guard, self._guard = self._guard, None
+        guard, self.process = self.process, None
         if self._line is not None:
             if take_over is not None:
                 # A line that closes early could be read as this process's death, which comes to the same.
@@ -133,8 +133,8 @@ class Guarding:
                 return
             self._watching.clear()
             # What is lost must not act in the middle of the next one's watch.
-            if self._guard is not None:
-                self._guard.kill()
+            if self.process is not None:
+                self.process.kill()
             self._dark(f"the guard was lost ({reason}): the light was shut, another guard is started")
             self._drop()
             before = reason
@@ -147,7 +147,7 @@ class Guarding:
         """Start a guard and wait until it watches; returns why it does not, or an empty text."""
         ours, theirs = socket.socketpair()
         try:
-            self._guard = subprocess.Popen(
+            self.process = subprocess.Popen(
                 [sys.executable, "-m", "acquisition.rig.guard", str(theirs.fileno())],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
@@ -164,7 +164,7 @@ class Guarding:
         hello = {
             "rig": dump_yaml(self._config),
             "pid": os.getpid(),
-            "log": None if self._journal is None else str(self._journal),
+            "log": None if self.journal is None else str(self.journal),
             "ports": list(self._ports),
             "before": before,
         }
@@ -199,10 +199,10 @@ class Guarding:
                     self._dark(f"{message['shut']}: it has shut the light")
             if self._is_dark_due and self._try_dark() is None:
                 self._tell("the light has been shut")
-            assert self._guard is not None
+            assert self.process is not None
             if silent_s > SILENT_KILL_S:
                 return f"it was silent for {SILENT_KILL_S:g} s"
-            silent = is_stopped(self._guard.pid) or silent_s > SILENT_SHUT_S
+            silent = is_stopped(self.process.pid) or silent_s > SILENT_SHUT_S
             if silent and not is_dark:
                 is_dark = True
                 self._watching.clear()
@@ -248,7 +248,7 @@ class Guarding:
                 self._line.send(json.dumps(message).encode() + b"\n", socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
 
     def _describe_end(self) -> str:
-        guard = self._guard
+        guard = self.process
         if guard is None:
             return "it did not begin"
         try:
@@ -258,13 +258,13 @@ class Guarding:
         return f"it ended with code {code}" if code >= 0 else f"it was killed by signal {-code}"
 
     def _drop(self) -> None:
-        if self._guard is not None:
+        if self.process is not None:
             # One that a tracer or a container holds ends when it is let go.
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._guard.wait(END_S)
+                self.process.wait(END_S)
         if self._line is not None:
             self._line.close()
-        self._guard = self._line = None
+        self.process = self._line = None
 
 
 class WatchedSource(LightSource):

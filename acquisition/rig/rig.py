@@ -83,7 +83,7 @@ class Rig(JointAxes):
         self._with_camera = with_camera
         self._ask = ask
         self._lines = LineRegistry(config.wire_log, self.clock)
-        self._guarding: Guarding | None = None
+        self.guarding: Guarding | None = None
         self._stop_failed: str | None = None
         self._was_stopped = False
         self._own_losses = 0
@@ -186,7 +186,7 @@ class Rig(JointAxes):
         AcquisitionError
             Something else than a file of its own is there, or the disc takes none.
         """
-        if self._guarding is None:
+        if self.guarding is None:
             if journal is not None:
                 try:
                     on_disc(f"look at {journal}", make_plain, journal)
@@ -194,7 +194,7 @@ class Rig(JointAxes):
                     raise AcquisitionError(
                         f"{journal} cannot be written ({error.strerror}). Remove it, or give another folder with --out."
                     ) from error
-            self._guarding = Guarding(
+            self.guarding = Guarding(
                 self.config, journal, self._lines.descriptors(), self._shut_at_once, tell=self._guard_says
             )
 
@@ -205,8 +205,8 @@ class Rig(JointAxes):
 
     def _require_guard(self) -> None:
         self.start_guard()
-        if self._guarding is not None:
-            self._guarding.require()
+        if self.guarding is not None:
+            self.guarding.require()
 
     def _shut_at_once(self) -> None:
         if self.source is not None and self.source.is_lit and not isinstance(self.source.inner, ManualSource):
@@ -214,7 +214,7 @@ class Rig(JointAxes):
 
     def light_losses(self) -> int:
         """How often the light was shut from outside so far: what was exposed meanwhile does not count."""
-        return self._own_losses + (0 if self._guarding is None else self._guarding.losses)
+        return self._own_losses + (0 if self.guarding is None else self.guarding.losses)
 
     def lose_light(self, why: str) -> None:
         """Shut the light from any thread; what is exposed meanwhile does not count."""
@@ -231,12 +231,12 @@ class Rig(JointAxes):
 
     def call_for_help(self, error: Exception) -> None:
         """Have the guard run the rig's alert command with an error, once."""
-        if self._guarding is not None:
-            self._guarding.say_failed(str(error))
+        if self.guarding is not None:
+            self.guarding.say_failed(str(error))
 
     def _end_guard(self, will_retry: bool) -> None:
         """Let the guard rest, or give it a light or an axis that does not obey. Raises AcquisitionError."""
-        guarding, self._guarding = self._guarding, None
+        guarding, self.guarding = self.guarding, None
         if guarding is None:
             return
         disobeyed = self.source.disobeyed if self.source is not None else None

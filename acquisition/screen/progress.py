@@ -21,7 +21,7 @@ class ConsoleProgress(Observer):
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._bar: Progress | None = None
+        self.bar: Progress | None = None
         self._task: Any = None
         self._done = self._pending = 0
         # Real time, as everything that a person reads.
@@ -40,7 +40,7 @@ class ConsoleProgress(Observer):
         text = f"{title}: {pending} states" + (f" of {len(table)}" if pending < len(table) else "")
         self._print(f"{self._place_in_campaign()}{text}")
         if self._console.is_terminal:
-            self._bar = Progress(
+            self.bar = Progress(
                 # What must be seen first; the words give way where the terminal is narrow.
                 *([TextColumn(f"{self._current + 1} of {self._captures}")] if self._captures else []),
                 BarColumn(bar_width=16),
@@ -52,8 +52,8 @@ class ConsoleProgress(Observer):
                 console=self._console,
                 transient=True,
             )
-            self._task = self._bar.add_task("starting", total=pending)
-            self._bar.start()
+            self._task = self.bar.add_task("starting", total=pending)
+            self.bar.start()
 
     def _place_in_campaign(self) -> str:
         """Which capture of the campaign this is and how long the rest takes, as the ones of this run took."""
@@ -68,8 +68,8 @@ class ConsoleProgress(Observer):
         return f"{place}, about {duration_text(each_s * (self._captures - self._current))} left, "
 
     def activity(self, text: str) -> None:
-        if self._bar is not None:
-            self._bar.update(self._task, description=printable(text))
+        if self.bar is not None:
+            self.bar.update(self._task, description=printable(text))
         else:
             say(self._console, text)
 
@@ -83,8 +83,8 @@ class ConsoleProgress(Observer):
         if report.saturated_fraction > 0 and "saturated" not in self._warned:
             self._warned.add("saturated")
             self._print(f"warning: state {report.state}: {100 * report.saturated_fraction:.3f} % of pixels saturated")
-        if self._bar is not None:
-            self._bar.update(self._task, description=text, completed=self._done)
+        if self.bar is not None:
+            self.bar.update(self._task, description=text, completed=self._done)
         elif time.monotonic() - self._line_s > LINE_EVERY_S:
             self._line_s = time.monotonic()
             left_s = (self._line_s - self._start_s) / self._done * (self._pending - self._done)
@@ -94,12 +94,12 @@ class ConsoleProgress(Observer):
         self._print(f"warning: {text}")
 
     def run_ended(self, status: str, details: dict[str, Any]) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
+        if self.bar is not None:
+            self.bar.stop()
+            self.bar = None
 
     def _print(self, text: str) -> None:
-        say(self._console if self._bar is None else self._bar.console, text)
+        say(self._console if self.bar is None else self.bar.console, text)
 
 
 def duration_text(seconds: float) -> str:

@@ -132,7 +132,7 @@ class StandaAxis(SessionReferenceAxis):
     def __init__(self, name: str, config: Config, line: StandaLine, lines: LineRegistry) -> None:
         super().__init__(name, config, lines.clock)
         self.config: Config = config
-        self._line, self._lines = line, lines
+        self.line, self._lines = line, lines
         label = f"axis {name} on {config.port}"
         maker, _, product, *hardware = line.ask(b"geti")
         if maker != b"XIMC":
@@ -169,14 +169,14 @@ class StandaAxis(SessionReferenceAxis):
         )
 
     def _read_borders(self) -> None:
-        flags, _, low, micro_low, high, micro_high = self._line.ask(b"geds")
+        flags, _, low, micro_low, high, micro_high = self.line.ask(b"geds")
         if flags & BORDER_IS_A_COUNT and flags & BORDER_STOPS_LEFT:
             self._device_min_deg = (low + micro_low / self._microsteps) / self.config.steps_per_deg
         if flags & BORDER_IS_A_COUNT and flags & BORDER_STOPS_RIGHT:
             self._device_max_deg = (high + micro_high / self._microsteps) / self.config.steps_per_deg
 
     def _status(self) -> Status:
-        values = self._line.ask(b"gets")
+        values = self.line.ask(b"gets")
         return Status(command=values[1], steps=values[5], microsteps=values[6], flags=values[15])
 
     def _do_read_counts(self) -> int:
@@ -191,7 +191,7 @@ class StandaAxis(SessionReferenceAxis):
         if status.runs:
             return True
         if self._homing and not self._saw_motion and status.homes and not status.command & COMMAND_FAILED:
-            self._line.command(b"zero")
+            self.line.command(b"zero")
             self._saw_motion = True
         return False
 
@@ -200,16 +200,16 @@ class StandaAxis(SessionReferenceAxis):
         # Both parts have the sign of the whole.
         steps = int(round(counts) / self._microsteps)
         data = LAYOUTS[b"move"].pack(steps, round(counts) - steps * self._microsteps)
-        self._line.command(b"move", data)
+        self.line.command(b"move", data)
 
     def _do_start_home(self) -> None:
         """Home, once the status no longer shows an earlier homing, which could be taken for the end of this one."""
         self._do_check_fault()
         if self._status().homes:
-            self._line.command(b"sstp")
+            self.line.command(b"sstp")
             self._wait_until_it_shows(homes=False)
         self._begin_homing()
-        self._line.command(b"home")
+        self.line.command(b"home")
         self._wait_until_it_shows(homes=True)
 
     def _wait_until_it_shows(self, homes: bool) -> None:
@@ -223,7 +223,7 @@ class StandaAxis(SessionReferenceAxis):
 
     def _do_stop(self) -> None:
         # Brakes: an abrupt stop of a stepper loses counts. Its reply is not waited for.
-        self._line.link.write(message(b"sstp"))
+        self.line.link.write(message(b"sstp"))
 
     def _do_check_fault(self) -> None:
         status = self._status()

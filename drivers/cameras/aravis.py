@@ -69,7 +69,7 @@ class AravisCamera(Camera):
         self._aravis = aravis
         self._camera = camera
         self._features = Features(name, aravis, glib_error, camera)
-        self._setup = Setup(name, config, aravis, camera, features=self._features)
+        self.setup = Setup(name, config, aravis, camera, features=self._features)
         self._glib_error = glib_error
         self._stream: FrameStream | None = None
         self._chunks: ChunkStamps | None = None
@@ -106,7 +106,7 @@ class AravisCamera(Camera):
             self._aravis,
             self._camera,
             self._features,
-            setup=self._setup,
+            setup=self.setup,
             fmt=self._pixel_format(),
             bits=self.bits,
         )
@@ -128,13 +128,13 @@ class AravisCamera(Camera):
 
     def warnings(self) -> list[str]:
         """Settings that could not be brought to a known state, in words."""
-        return self._setup.warnings()
+        return self.setup.warnings()
 
     def _converter_bits(self) -> int | None:
-        return self._setup.converter_bits
+        return self.setup.converter_bits
 
     def _pixel_format(self) -> PixelFormat:
-        return self._setup.pixel_format() if self._format is None else self._format
+        return self.setup.pixel_format() if self._format is None else self._format
 
     # --- settings ----------------------------------------------------------------------------------------
 
@@ -143,23 +143,23 @@ class AravisCamera(Camera):
         settings = self._config.settings.model_copy(update=settings.model_dump(exclude_none=True))
         structure = structure_of(settings)
         exposure_s = settings.exposure_s
-        fits = exposure_s is None or exposure_s == self._setup.exposure_s or self._setup.light.fits(exposure_s)
+        fits = exposure_s is None or exposure_s == self.setup.exposure_s or self.setup.light.fits(exposure_s)
         if self._stream is None or structure != self._asked_structure or not fits:
             self._stop()
             self._asked_structure = None
-            self._setup.set_structure(settings)
-            self._setup.set_light(settings, stopped=True)
-            self._setup.require_known_state()
-            self._format = self._setup.pixel_format()
+            self.setup.set_structure(settings)
+            self.setup.set_light(settings, stopped=True)
+            self.setup.require_known_state()
+            self._format = self.setup.pixel_format()
             self._start()
             self._asked_structure = structure
         else:
             self._drain()
-            self._setup.set_light(settings, stopped=False)
-        return self._setup.read_back(settings.frame_average)
+            self.setup.set_light(settings, stopped=False)
+        return self.setup.read_back(settings.frame_average)
 
     def _do_applied(self) -> CameraSettings:
-        return self._setup.applied()
+        return self.setup.applied()
 
     # --- stream ------------------------------------------------------------------------------------------
 
@@ -223,26 +223,26 @@ class AravisCamera(Camera):
         self._discard_outstanding()
         self._drain()
         self._check_control("trigger")
-        if not self._setup.hardware:
+        if not self.setup.hardware:
             self._wait_armed()
         # Real time: frames carry the time of day at which their first packet came.
         self._sent_unix_s = time.time()
         self._sent_s = self._clock.now_s()
         self._outstanding = True
         self._early_s = None
-        if not self._setup.hardware:
+        if not self.setup.hardware:
             self._features.command("TriggerSoftware")
             # A command that is lost is sent again after up to a second, and the camera begins when it hears it.
             self._heard_s = self._clock.now_s()
 
     def _wait_armed(self) -> None:
         """Wait until the camera heeds a trigger: one that comes too early is ignored."""
-        deadline_s = self._clock.now_s() + self._setup.light_s + self._transfer_s()
-        while not self._setup.status.armed():
+        deadline_s = self._clock.now_s() + self.setup.light_s + self._transfer_s()
+        while not self.setup.status.armed():
             if self._clock.now_s() > deadline_s:
                 self._restart()
                 raise self._frame_lost(
-                    f"not ready for a trigger within {self._setup.light_s + self._transfer_s():.2f} s",
+                    f"not ready for a trigger within {self.setup.light_s + self._transfer_s():.2f} s",
                     "Is it in continuous acquisition with TriggerMode On? Another trigger selector may hold it back",
                 )
             self._check_control("wait until the trigger is armed")
@@ -250,22 +250,22 @@ class AravisCamera(Camera):
 
     def _do_wait_exposed(self) -> None:
         stream = self._live_stream()
-        if self._setup.hardware:
+        if self.setup.hardware:
             self._wait_for_hardware_trigger(stream)
             return
-        end_s = self._heard_s + self._setup.light_s
-        self._sleep_until(end_s - max(_EARLY * self._setup.exposure_s, _EARLY_S))
+        end_s = self._heard_s + self.setup.light_s
+        self._sleep_until(end_s - max(_EARLY * self.setup.exposure_s, _EARLY_S))
         while (arrival := stream.take(0)) is not None:
             if self._is_ours(arrival):
                 stream.unread(arrival)
                 break
             self._throw_away(stream, arrival)
         self._sleep_until(end_s)
-        if not self._setup.status.tells_exposing:
+        if not self.setup.status.tells_exposing:
             self._sleep_until(end_s + self._config.trigger_latency_s)
             return
         deadline_s = end_s + _TRANSFER_MARGIN_S
-        while self._setup.status.exposing():
+        while self.setup.status.exposing():
             if self._clock.now_s() > deadline_s:
                 self._restart()
                 raise self._frame_lost(
@@ -275,7 +275,7 @@ class AravisCamera(Camera):
 
     def _wait_for_hardware_trigger(self, stream: FrameStream) -> None:
         # The end of the exposure is not visible, so it counts as ended when the frame is there.
-        deadline_s = self._sent_s + self._config.trigger_timeout_s + self._setup.light_s + self._transfer_s()
+        deadline_s = self._sent_s + self._config.trigger_timeout_s + self.setup.light_s + self._transfer_s()
         while not stream.has_arrival():
             if self._clock.now_s() > deadline_s:
                 self._restart()
@@ -288,8 +288,8 @@ class AravisCamera(Camera):
 
     def _do_frame(self) -> Frame:
         stream = self._live_stream()
-        deadline_s = self._sent_s + self._setup.light_s + self._transfer_s()
-        if self._setup.hardware:
+        deadline_s = self._sent_s + self.setup.light_s + self._transfer_s()
+        if self.setup.hardware:
             deadline_s += self._config.trigger_timeout_s
         while True:
             arrival = stream.take(_SLICE_S)
@@ -314,8 +314,8 @@ class AravisCamera(Camera):
 
     def _is_ours(self, arrival: Arrival) -> bool:
         """True unless the frame left the camera before the exposure under way can have ended, or has an old number."""
-        exposure_s = 0.0 if self._config.answers_early else self._setup.exposure_s
-        light_s = 0.0 if self._config.answers_early else self._setup.light_s
+        exposure_s = 0.0 if self._config.answers_early else self.setup.exposure_s
+        light_s = 0.0 if self._config.answers_early else self.setup.light_s
         came_s = self._camera_clock.came_s(arrival.camera_time_ns, arrival.first_packet_s, exposure_s)
         ended_s = self._sent_unix_s + light_s - max(_EARLY * exposure_s, _EARLY_S)
         # Without its first packet a frame has no time; it is not whole either.
@@ -332,11 +332,11 @@ class AravisCamera(Camera):
         raise self._frame_lost(f"frame {arrival.frame_id or 'without a number'} is not whole ({arrival.status})")
 
     def _make_frame(self, arrival: Arrival) -> Frame:
-        fmt, size = self._pixel_format(), self._setup.size
+        fmt, size = self._pixel_format(), self.setup.size
         if wrong := other_layout(arrival, fmt, size):
             raise self._frame_lost(wrong)
         pixels = counts_of(arrival, fmt, size, self.bits, shift=self._config.shift, camera=f"camera {self.name}")
-        host_time_s = arrival.first_packet_s if self._setup.hardware else self._sent_unix_s
+        host_time_s = arrival.first_packet_s if self.setup.hardware else self._sent_unix_s
         time_ns = arrival.camera_time_ns if self._chunks is None else self._chunks.time_ns(arrival)
         return Frame(pixels, arrival.frame_id, time_ns, host_time_s)
 
@@ -346,8 +346,8 @@ class AravisCamera(Camera):
             self._outstanding = False
             return
         stream = self._live_stream()
-        deadline_s = self._sent_s + self._setup.light_s + self._transfer_s()
-        while not self._setup.hardware and self._clock.now_s() < deadline_s:
+        deadline_s = self._sent_s + self.setup.light_s + self._transfer_s()
+        while not self.setup.hardware and self._clock.now_s() < deadline_s:
             arrival = stream.take(_SLICE_S)
             if arrival is None:
                 self._check_control("wait for an abandoned exposure")
@@ -360,7 +360,7 @@ class AravisCamera(Camera):
         self._restart()
 
     def _transfer_s(self) -> float:
-        return self._pixel_format().payload_bytes(*self._setup.size) / _SLOWEST_BYTES_S + _TRANSFER_MARGIN_S
+        return self._pixel_format().payload_bytes(*self.setup.size) / _SLOWEST_BYTES_S + _TRANSFER_MARGIN_S
 
     def _sleep_until(self, end_s: float) -> None:
         while (rest_s := end_s - self._clock.now_s()) > 0:
@@ -379,7 +379,7 @@ class AravisCamera(Camera):
         if self._early_s is None:
             return self._frame_lost(f"no frame within {waited_s:.2f} s of the trigger")
         return self._frame_lost(
-            f"the only frame came {self._early_s:.3f} s after the trigger, before the {self._setup.exposure_s:g} s of "
+            f"the only frame came {self._early_s:.3f} s after the trigger, before the {self.setup.exposure_s:g} s of "
             "its exposure were over, and was discarded as one of an earlier exposure",
             "Does the camera expose as long as it says, and does nothing else trigger it? A simulated camera that does "
             "not wait for its exposure needs `answers_early: true` in the rig file",
@@ -410,7 +410,7 @@ class AravisCamera(Camera):
         left = [self._forget_stream(), self._camera]
         self._camera = self._chunks = None
         self._features.release()
-        self._setup.release()
+        self.setup.release()
         if lost:
             # Aravis takes leave with four commands, each of which waits 2.5 s for a camera that is gone.
             threading.Thread(target=let_go, args=(left,), name=f"leave camera {self.name}", daemon=True).start()

@@ -139,16 +139,16 @@ class GigeCamera:
         description = self._description
         try:
             memory, nodes, texts = _powered_up(description.root, description.source, self._sensor, self.serial)
-            self._memory = memory.copy()
-            self._nodes = nodes.copy(self._memory)
-            self._features = FeatureValues(self._nodes, self._sensor, complete=self._complete)
+            self.memory = memory.copy()
+            self.nodes = nodes.copy(self.memory)
+            self.features = FeatureValues(self.nodes, self._sensor, complete=self._complete)
             for name, value in description.at_power_up.items():
-                if name in self._nodes:
+                if name in self.nodes:
                     self.leave(name, value)
-            self._default = self._memory.copy()
+            self.default = self.memory.copy()
         except RecursionError as error:
             raise NodeError(f"{description.source}: its features refer to each other without an end") from error
-        self._xml_at = free_address(self._nodes)
+        self._xml_at = free_address(self.nodes)
         self._texts = texts
 
     # --- life --------------------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ class GigeCamera:
             self._prepare()
         self._plugged_in = self._was_on = True
         xml = (self._description.name, self._xml_at, len(self._description.served))
-        boot(self._memory, self.address, self._texts, xml)
+        boot(self.memory, self.address, self._texts, xml)
         try:
             self._channel.open(self.address)
         except OSError as error:
@@ -215,7 +215,7 @@ class GigeCamera:
     def value(self, name: str) -> Number:
         """Value of a feature or a register, by its name in the description. Raises NodeError."""
         with self._lock:
-            return self._nodes.value(name)
+            return self.nodes.value(name)
 
     def leave(self, name: str, value: Number | str) -> None:
         """Set a feature as another program left it: a number, an entry, or 0 and 1 for a flag.
@@ -224,10 +224,10 @@ class GigeCamera:
         """
         with self._lock:
             if isinstance(value, str):
-                self._nodes.choose(name, value)
+                self.nodes.choose(name, value)
             else:
-                self._nodes.set_value(name, value)
-            self._features.follow()
+                self.nodes.set_value(name, value)
+            self.features.follow()
 
     # --- what the control channel asks for ---------------------------------------------------------------
 
@@ -237,21 +237,21 @@ class GigeCamera:
         if 0 <= start < MOST_XML_BYTES:
             return self._description.served[start : start + count].ljust(count, b"\0")
         with self._lock:
-            return self._memory.read(address, count)
+            return self.memory.read(address, count)
 
     def write(self, address: int, data: bytes) -> None:
         """Write registers, and obey the commands among them."""
         with self._wake:
-            self._memory.write(address, data)
+            self.memory.write(address, data)
             if address == PACKET_SIZE and self._bootstrap(PACKET_SIZE) & _TEST_PACKET:
-                self._memory.write(PACKET_SIZE, struct.pack(">I", self._bootstrap(PACKET_SIZE) & ~_TEST_PACKET))
+                self.memory.write(PACKET_SIZE, struct.pack(">I", self._bootstrap(PACKET_SIZE) & ~_TEST_PACKET))
                 send_test_packet(self._bootstrap, self.address)
             try:
-                commands = self._features.heard(address, len(data))
-                self._features.follow()
+                commands = self.features.heard(address, len(data))
+                self.features.follow()
                 if any(load in commands for load in LOADS):
-                    self._memory.restore(self._default, but=_LINK)
-                    self._features.follow()
+                    self.memory.restore(self.default, but=_LINK)
+                    self.features.follow()
                 if TRIGGER in commands:
                     self._trigger(by_program=True)
             except (NodeError, ArithmeticError, ValueError) as error:
@@ -277,17 +277,17 @@ class GigeCamera:
             self._acquiring, self._triggered, self._frame_id = acquiring, False, self.first_frame_id - 1
             self._run_number += 1
             self._armed_at_s = 0.0
-            self._features.show(exposing=False, armed=True)
+            self.features.show(exposing=False, armed=True)
             self._wake.notify_all()
 
     def _bootstrap(self, address: int) -> int:
-        return int(struct.unpack(">I", self._memory.read(address, 4))[0])
+        return int(struct.unpack(">I", self.memory.read(address, 4))[0])
 
     # --- exposures ---------------------------------------------------------------------------------------
 
     def _trigger(self, *, by_program: bool, unasked: bool = False) -> None:
         with self._wake:
-            source = self._features.trigger_source()
+            source = self.features.trigger_source()
             is_source = source is not None and by_program == (source == "Software")
             if not self._acquiring or not (is_source or unasked):
                 return
@@ -296,7 +296,7 @@ class GigeCamera:
                 return
             self._triggered, self.triggered_s = True, time.monotonic()
             # Before the command is answered: the status then is "exposing".
-            self._features.show(exposing=True, armed=False)
+            self.features.show(exposing=True, armed=False)
             self._wake.notify_all()
 
     def _run(self) -> None:
@@ -318,7 +318,7 @@ class GigeCamera:
             self._busy = False
             if self._run_number == run_number:
                 self._armed_at_s = time.monotonic() + self._arming_s
-                self._features.show(exposing=False, armed=not self._arming_s)
+                self.features.show(exposing=False, armed=not self._arming_s)
         if frame is not None:
             time.sleep(hold_back_s)
             self.sent.append(frame)
@@ -331,13 +331,13 @@ class GigeCamera:
         with self._wake:
             self._wake.wait_for(lambda: self._run_number != run_number, max(0.0, self._armed_at_s - time.monotonic()))
             if self._run_number == run_number:
-                self._features.show(exposing=False, armed=True)
+                self.features.show(exposing=False, armed=True)
 
     def _wait_for_start(self) -> int | None:
         """Which start of the acquisition the exposure belongs to that begins now; None where none does."""
         with self._wake:
             self._wake.wait_for(lambda: self._acquiring or not self._plugged_in)
-            if self._acquiring and self._features.trigger_source() is None:
+            if self._acquiring and self.features.trigger_source() is None:
                 self._wake.wait_for(lambda: not self._acquiring, _FREE_RUN_S)
                 if self._acquiring:
                     self._triggered = True
@@ -351,22 +351,22 @@ class GigeCamera:
     def _frame(self, run_number: int) -> FramePackets | None:
         """The frame of an exposure; None where the acquisition ended before it."""
         with self._wake:
-            fmt = pixel_format_of(*self._features.pixel_format())
-            self._features.show(exposing=True, armed=False)
-            info = exposed(self._features, self._features.info(self._frame_id))
-            self._wake.wait_for(lambda: self._run_number != run_number, delay_s(self._features))
+            fmt = pixel_format_of(*self.features.pixel_format())
+            self.features.show(exposing=True, armed=False)
+            info = exposed(self.features, self.features.info(self._frame_id))
+            self._wake.wait_for(lambda: self._run_number != run_number, delay_s(self.features))
             start_s, time_ns = time.monotonic(), time.time_ns()
         counts = counts_of(self._source, info, fmt, self.bits)
         with self._lock:
-            counts = processed(self._features, info, counts, fmt.bits)
+            counts = processed(self.features, info, counts, fmt.bits)
         payload = fmt.encode(counts).tobytes()
         with self._wake:
             remaining_s = start_s + info.exposure_s - time.monotonic()
             self._wake.wait_for(lambda: self._run_number != run_number, max(0.0, remaining_s))
             if self._run_number != run_number:
                 return None
-            code, _ = self._features.pixel_format()
-            chunks = self._features.time_chunk(time_ns)
+            code, _ = self.features.pixel_format()
+            chunks = self.features.time_chunk(time_ns)
         if chunks is not None:
             if self.timeless_frames > 0:
                 self.timeless_frames, chunks = self.timeless_frames - 1, {}

@@ -50,7 +50,7 @@ class SimulatedRig:
         #: A source without a cable is covered by the operator: False while it is covered.
         self.uncovered: Callable[[], bool] = lambda: True
         self._with_camera = with_camera
-        self._ports: dict[str, ServedPort] = {}
+        self.served_ports: dict[str, ServedPort] = {}
         self._user_angle: dict[str, Callable[[float], float]] = {}
         self._next_index = 0
         self._started_s = time.monotonic()
@@ -60,7 +60,7 @@ class SimulatedRig:
         """Start every emulator. Raises ConfigError for a kind or an axis that there is not."""
         for name, port in self.config.ports.items():
             self.emulators[name] = self._emulator(name)
-            self._ports[name] = port_for(self.emulators[name])
+            self.served_ports[name] = port_for(self.emulators[name])
             for text in port.faults:
                 self.emulators[name].faults.add(parse_fault(text))
         for name, axis in self.config.axes.items():
@@ -96,11 +96,11 @@ class SimulatedRig:
     def stop(self) -> None:
         """End the emulators; the first failure is raised after all were tried."""
         with contextlib.ExitStack() as stack:
-            for port in self._ports.values():
+            for port in self.served_ports.values():
                 stack.callback(port.close)
             if self.camera is not None:
                 stack.callback(self._stop_camera)
-        self._ports.clear()
+        self.served_ports.clear()
 
     def _start_camera(self) -> None:
         config = self.config
@@ -132,10 +132,10 @@ class SimulatedRig:
 
     def port(self, name: str) -> str:
         """Device path of an emulated port. Raises ConfigError if there is none of that name."""
-        if name not in self._ports:
-            listing = ", ".join(sorted(self._ports))
+        if name not in self.served_ports:
+            listing = ", ".join(sorted(self.served_ports))
             raise ConfigError(f"port sim:{name}: `simulator.ports` has {listing}")
-        return self._ports[name].path
+        return self.served_ports[name].path
 
     def connect(self, axis: str, direction: int, zero_deg: float) -> None:
         """Tell how the rig file turns this axis's angle into the user's; the truth follows the same zero."""

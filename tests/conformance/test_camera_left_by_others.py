@@ -50,7 +50,7 @@ def test_the_bench_rests_until_a_delayed_exposure_has_ended(bench_camera: Left, 
         access = "RW"
     bench_camera.text = where + '<FloatReg Name="TriggerDelayReg">' + named.replace("RW", access, 1)
     simulated = bench_camera.play()
-    with simulated._nodes.assuming("TriggerSelector", "FrameStart"):
+    with simulated.nodes.assuming("TriggerSelector", "FrameStart"):
         simulated.leave("TriggerDelay", 150_000.0)
     camera = bench_camera.open()
     if access == "RO":
@@ -196,7 +196,7 @@ def test_six_decibels_are_six_decibels_in_any_unit(bench_camera: Left, unit: str
     simulated = bench_camera.play()
     back = bench_camera.open(gain_unit=rig_unit).configure(LIGHT.model_copy(update={"gain_db": 6.0}))
     assert back.gain_db == pytest.approx(6.0, abs=1e-3)
-    assert simulated._nodes.value("Gain") == pytest.approx(6.0 if "dB" in (unit, rig_unit) else 1.9953, abs=1e-3)
+    assert simulated.nodes.value("Gain") == pytest.approx(6.0 if "dB" in (unit, rig_unit) else 1.9953, abs=1e-3)
 
 
 def test_a_gain_without_a_unit_is_refused(bench_camera: Left) -> None:
@@ -267,7 +267,7 @@ def test_a_load_that_takes_its_time_is_waited_for(bench_camera: Left, monkeypatc
     bench_camera.choice("UserSetSelector", "Default")
     bench_camera.add("UserSetLoad", '<Command Name="UserSetLoad">VALUE<CommandValue>1</CommandValue></Command>')
     simulated = bench_camera.play()
-    memory = simulated._memory
+    memory = simulated.memory
     monkeypatch.setattr(memory, "restore", lambda *args, **kept: load.append((args, kept)) or timer.start())
     load: list[tuple[tuple[object, ...], dict[str, object]]] = []
     restore = type(memory).restore
@@ -285,7 +285,7 @@ def test_a_load_that_changes_nothing_is_seen(bench_camera: Left) -> None:
     bench_camera.add("UserSetLoad", '<Command Name="UserSetLoad">VALUE<CommandValue>1</CommandValue></Command>')
     bench_camera.choice("ShotMixing", "Plain", "Mixed")
     simulated = bench_camera.play(ShotMixing="Mixed")
-    simulated._features.heard = lambda *_: []  # type: ignore[method-assign]
+    simulated.features.heard = lambda *_: []  # type: ignore[method-assign]
     camera = bench_camera.open()
     camera.configure(LIGHT)
     (text,) = camera.warnings()

@@ -94,7 +94,7 @@ def test_the_status_of_the_exposure_is_told(stack: ExitStack, tmp_path: Path, be
     stack.enter_context(GigeCamera("PLAYED1", *SIZE, wait_and_show, description=path))
     camera = opened(stack)
     camera.configure(CameraSettings(exposure_s=1e-3))
-    status = camera._setup.status
+    status = camera.setup.status
     assert (status.exposing(), status.armed()) == (False, True)
     exposure = camera.trigger()
     assert (status.exposing(), status.armed()) == (True, False)

@@ -171,7 +171,7 @@ def test_frames_are_right_or_the_camera_is_refused_in_words(path: Path, tmp_path
                 continue
         if rng.integers(2):
             # A camera whose default is what somebody left.
-            camera._default = camera._memory.copy()
+            camera.default = camera.memory.copy()
         driver = listed.open(gain_raw_per_db=RAW_PER_DB)
         gains = [name for name in ("Gain", "GainAbs", "GainRaw") if name in listed.features]
         gain_db = GAIN_DB if gains else None
@@ -188,7 +188,7 @@ def test_frames_are_right_or_the_camera_is_refused_in_words(path: Path, tmp_path
             frame, info = exposure.frame(), listed.infos[-1]
             assert info.exposure_s == pytest.approx(EXPOSURE_S, rel=1e-3)
             # On a busy machine the played camera begins later than its trigger comes.
-            began_s = camera.triggered_s + delay_s(camera._features)
+            began_s = camera.triggered_s + delay_s(camera.features)
             assert moved_s >= began_s + info.exposure_s - EARLY_S
             if gain_db is not None:
                 per_db = RAW_PER_DB if gains == ["GainRaw"] else 1

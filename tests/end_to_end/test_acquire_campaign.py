@@ -105,7 +105,7 @@ def test_stopped_campaign_goes_on_with_the_state_it_stopped_at(acquire, small_ri
 def test_a_door_open_between_captures(acquire, small_rig, campaign, tmp_path, monkeypatch, goes_on):
     from acquisition.campaign.run import CampaignRun
 
-    take, names = CampaignRun._take, []
+    take, names = CampaignRun.take, []
 
     def opened_before_the_second(self, capture, job):
         names.append(capture.name)
@@ -115,7 +115,7 @@ def test_a_door_open_between_captures(acquire, small_rig, campaign, tmp_path, mo
             threading.Timer(0.5, shutter.trip, (False,)).start()
         return take(self, capture, job)
 
-    monkeypatch.setattr(CampaignRun, "_take", opened_before_the_second)
+    monkeypatch.setattr(CampaignRun, "take", opened_before_the_second)
     lines = {"retries": "3", "retry_wait_s": "1", "continue_after_interlock": str(goes_on).lower()}
     file = campaign(plans="{stokes: stokes.yaml}", references="[]", **lines)
     code, _, err = acquire("--campaign", file, "--rig", small_rig(), "--out", tmp_path)

@@ -130,7 +130,7 @@ def test_a_capture_of_40_states_is_paused_and_resumed(bench, engine, tmp_path):
     (event,) = _events(documents)
     with Capture(event["capture_file"]) as capture:
         assert capture.status == "complete"
-        assert len(capture.done) == len(device._job.table) == 44
+        assert len(capture.done) == len(device.job.table) == 44
         assert [len(segment.states) > 0 for segment in capture.segments] == [True, True]
         np.testing.assert_array_equal(event["capture_psg_deg"], capture.angles_deg["psg"])
         assert [name for name, _ in documents if name.startswith("stream")] == ["stream_resource", "stream_datum"]
@@ -187,7 +187,7 @@ def test_tiled_reads_back_what_it_was_told(bench, engine, tiled, tmp_path):
     # The same server, for it takes seconds to start: a scan of the camera alone.
     camera, pictures = bench.camera, []
     camera.folder = tmp_path / "frames"
-    run.subscribe(lambda *_: pictures.append(camera._frame.copy()), "event")
+    run.subscribe(lambda *_: pictures.append(camera.frame.copy()), "event")
     (uid,) = run(scan([camera], bench.axes["psg"], 10, 40, 4))
     stream = tiled[uid]["primary"]
     _assert_same(stream["camera_frame"].read(), np.stack(pictures))
@@ -211,7 +211,7 @@ def _paused(run, device, folder) -> None:
         if moves == 7:
             # The RunEngine answers once the state has ended, so not in the thread that takes it.
             threading.Thread(target=run.request_pause).start()
-            while not device._stop.requested:
+            while not device.stop_request.requested:
                 time.sleep(0.001)
         return wait(motions)
 

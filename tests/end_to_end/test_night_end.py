@@ -136,7 +136,7 @@ def _shown(width: int, captures: int = 0) -> str:
     pixels = np.zeros((2, 2), np.uint16)
     for state in range(20):
         progress.state_done(StateReport(state, "sample", positions, 0.02, 0.0, 0.05, 1.0, pixels))
-    progress._bar.refresh()
+    progress.bar.refresh()
     progress.run_ended("complete", {})
     return out.getvalue()
 

@@ -64,18 +64,18 @@ def test_the_page_of_a_product_opens_on_what_it_is_about(xi0_product):
 
 
 def test_squares_of_pixels_show_what_the_noise_of_single_pixels_hides():
-    from processing.diagnosis.instrument.figures import _cells, _noise_of_cells
+    from processing.diagnosis.instrument.figures import cell_means, noise_of_cells
 
     rng = np.random.default_rng(5)
     image = rng.normal(0, 1, (6, 200, 240)) + 0.3 * np.sin(np.arange(240) / 40)
     image[:, :50] = np.nan
-    cells = _cells(image)
+    cells = cell_means(image)
     assert cells.shape == (6, 33, 40)
     assert np.isnan(cells[:, :8]).all()
     assert np.isfinite(cells[:, 9:]).all()
-    assert _noise_of_cells(image) == pytest.approx(1 / 6, rel=0.02)
+    assert noise_of_cells(image) == pytest.approx(1 / 6, rel=0.02)
     pattern = 0.3 * np.sin((np.arange(40) * 6 + 2.5) / 40)
     assert np.corrcoef(cells[0, 10:].mean(axis=0), pattern)[0, 1] > 0.98
     # A point detector: one pixel.
-    assert _cells(np.ones((4, 1, 1))).shape == (4, 1, 1)
-    assert _noise_of_cells(np.ones((4, 1, 1))) is None
+    assert cell_means(np.ones((4, 1, 1))).shape == (4, 1, 1)
+    assert noise_of_cells(np.ones((4, 1, 1))) is None

@@ -206,7 +206,7 @@ def test_lit_darks_of_a_run_that_was_cut_are_found_when_it_goes_on(run_with):
 def test_a_cable_that_is_pulled_ends_the_run_and_plugged_again_it_goes_on(run_with, intact, line):
     def pull(rig, state, retake):
         if state == 6:
-            rig.simulation._ports[line].close()
+            rig.simulation.served_ports[line].close()
 
     error, path = run_with(pull)
     if error is None:

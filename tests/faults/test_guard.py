@@ -91,14 +91,14 @@ def watched_rig(served):
 
 
 def _guard_of(rig):
-    return rig._guarding._guard.pid
+    return rig.guarding.process.pid
 
 
 def test_no_light_before_a_guard_watches_and_the_light_goes_off_with_the_guard(watched_rig):
     rig, simulation, _ = watched_rig
     rig.source.set_light(True)
     assert _lit(simulation)
-    journal = Path(rig._guarding._journal)
+    journal = Path(rig.guarding.journal)
     _until(lambda: journal.exists() and "guard watches" in journal.read_text())
     for number, kind in enumerate((signal.SIGKILL, signal.SIGSTOP), start=1):
         before = _guard_of(rig)
@@ -200,7 +200,7 @@ def test_a_guard_writes_to_a_port_that_somebody_holds(watched_rig):
     rig, simulation, _ = watched_rig
     rig.source.set_light(True)
     held = with_held_ports(rig.config, rig._lines.descriptors())
-    assert Guard(held, os.getpid(), Journal(None))._try_light() is None
+    assert Guard(held, os.getpid(), Journal(None)).try_light() is None
     assert not _lit(simulation)
 
 

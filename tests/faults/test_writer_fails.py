@@ -57,7 +57,7 @@ def test_a_disc_that_takes_nothing_shuts_the_light_and_ends_the_run(run_with, in
         def warning(self, text):
             lit.append((text, rigs[0].simulation.light()))
 
-    monkeypatch.setattr(CaptureRunner, "_set_light", _then(CaptureRunner._set_light, lambda: lit.append("set")))
+    monkeypatch.setattr(CaptureRunner, "set_light", _then(CaptureRunner.set_light, lambda: lit.append("set")))
     with monkeypatch.context() as patch:
         _failing_at(patch, 5, lambda: blocked.wait(60))
         error, path = run_with(lambda rig, *_: rigs.append(rig), observers=(Told(),))

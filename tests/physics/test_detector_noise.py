@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter
 from steady_capture import steady_capture
 
 from processing.diagnosis.captures.capture_data import CaptureData
-from processing.diagnosis.captures.noise import _compare, detector_noise
+from processing.diagnosis.captures.noise import compare_scatter, detector_noise
 from processing.diagnosis.captures.read_capture import read_capture
 from processing.diagnosis.captures.screening import screen_capture
 from processing.diagnosis.instrument.diagnose import diagnose_captures
@@ -115,9 +115,9 @@ def test_a_bright_rim_of_few_pixels_is_no_offset_of_columns():
     inside[:16, :6], inside[18:, :6] = False, False
     light = np.where(inside, np.where(np.arange(side) < 6, 5.0, 0.5), np.nan) * np.ones((states, 1, 1))
     r = np.sqrt(light) * random.standard_normal(light.shape)
-    excess = _compare(r, light, 0.01 * light, 1.0)
+    excess = compare_scatter(r, light, 0.01 * light, 1.0)
     assert excess.rows == excess.columns == 0
-    excess = _compare(r + 0.3 * random.standard_normal((states, 1, side)), light, 0.01 * light, 1.0)
+    excess = compare_scatter(r + 0.3 * random.standard_normal((states, 1, side)), light, 0.01 * light, 1.0)
     assert excess.columns == pytest.approx(0.09 / 0.5, rel=0.3)
     assert excess.rows == 0
 
@@ -128,7 +128,8 @@ def test_a_correlation_of_neighbours_is_as_uncertain_as_bright_pixels_are_few():
     light = np.where(random.random((1, 36, 36)) < 0.05, 30.0, 0.3) * np.ones((24, 1, 1))
     light[:, random.random((36, 36)) < 0.5] = np.nan
     found = [
-        _compare(np.sqrt(light) * random.standard_normal(light.shape), light, 0.01 * light, 1.0) for _ in range(80)
+        compare_scatter(np.sqrt(light) * random.standard_normal(light.shape), light, 0.01 * light, 1.0)
+        for _ in range(80)
     ]
     scatter = max(np.std([f.right for f in found]), np.std([f.down for f in found]))
     assert np.mean([f.alike_error for f in found]) == pytest.approx(scatter, rel=0.3)

@@ -9,7 +9,7 @@ from bench_capture import bench_capture
 from processing.commands import diagnose
 from processing.commands.loaded_late import diagnose_summary
 from processing.diagnosis.instrument.diagnose import diagnose_captures
-from processing.diagnosis.instrument.mueller_error import MOST_STORED, MuellerErrors, _leading
+from processing.diagnosis.instrument.mueller_error import MOST_STORED, MuellerErrors, leading_directions
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.likely_set import likely_set
@@ -117,7 +117,7 @@ def test_directions_hold_what_another_capture_will_have_too():
     size = 41
     covariance, lasts = np.diag([*np.full(40, 1.0), 0.01]), np.arange(size) == 40
     covariance[40, 0] = covariance[0, 40] = 0.05
-    stored = _leading(covariance, np.eye(size), lasts)[1][:, :MOST_STORED]
+    stored = leading_directions(covariance, np.eye(size), lasts)[1][:, :MOST_STORED]
     product = stored @ stored.T
     assert product[40, 40] == pytest.approx(0.01, rel=0.05)
     # What they share with it belongs to it.
@@ -125,7 +125,7 @@ def test_directions_hold_what_another_capture_will_have_too():
 
 
 def test_without_anything_that_lasts_the_largest_come_first():
-    size, _ = _leading(np.diag([1.0, 4.0]), np.eye(2), np.zeros(2, dtype=bool))
+    size, _ = leading_directions(np.diag([1.0, 4.0]), np.eye(2), np.zeros(2, dtype=bool))
     assert size[0] == pytest.approx(4 * size[1])
 
 
@@ -139,8 +139,8 @@ def test_what_varies_over_the_image_is_asked_for_beside_all_groups():
     state = likely_set(sets)
     posterior = Some(samples=Some(best=state), sets=sets)
     assert state.unit > 1000
-    assert WholeBench._least_unit(Some(whole=Some(noise_known=True)), posterior) < 10
-    assert WholeBench._least_unit(Some(whole=Some(noise_known=False)), posterior) == state.unit
+    assert WholeBench.least_unit(Some(whole=Some(noise_known=True)), posterior) < 10
+    assert WholeBench.least_unit(Some(whole=Some(noise_known=False)), posterior) == state.unit
 
 
 def test_what_is_found_and_not_used_is_uncertain_as_a_whole():
@@ -154,6 +154,6 @@ def test_what_is_found_and_not_used_is_uncertain_as_a_whole():
     errors = MuellerErrors(space, np.array([1.0, 4.0]), np.diag([0.01, 0.09]), np.zeros((16, 2, 2)), (direction,), none)
     used = Some(space=Space((drift,)), fit=Some(values=np.array([1.0])))
     assert errors.corrected_values(used).tolist() == [1.0, 0.0]
-    change = errors._change(*direction[:1], errors.corrected_values(used), direction[1])
+    change = errors.change(*direction[:1], errors.corrected_values(used), direction[1])
     assert change.before == pytest.approx(np.sqrt(17.1))
     assert change.after == pytest.approx(np.sqrt(16.1))

@@ -12,9 +12,9 @@ from processing.diagnosis.instrument.diagnose import white
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_blocks, noise_information
-from processing.diagnosis.instrument.structure import Residual, _tests, descriptions
+from processing.diagnosis.instrument.structure import Residual, descriptions, structure_tests
 from processing.diagnosis.search.decision import in_deviations
-from processing.diagnosis.search.linearization import _with_noise_of_counts
+from processing.diagnosis.search.linearization import with_noise_of_counts
 from processing.diagnosis.search.space import Sums
 
 STATES, SIDE, SIGMA = 8, 240, 0.01
@@ -74,7 +74,7 @@ def test_tests_of_pure_noise_scatter_by_one_standard_deviation():
     for _ in range(100):
         residual = np.tensordot(outside, random.normal(size=(rows, side, side)), 1).astype(np.float32)
         noise = {"shown": np.ones(rows), "alike": np.zeros((rows, 2)), "columns": 16, "spread": 1.0}
-        tests, _ = _tests(residual, around, expected, np.ones((side, side), dtype=bool), **noise)
+        tests, _ = structure_tests(residual, around, expected, np.ones((side, side), dtype=bool), **noise)
         scores.append([value for name, value in tests.items() if name != "sum of squares"])
     assert len(scores[0]) == 5
     assert np.std(scores, axis=0) == pytest.approx(np.ones(5), abs=0.25)
@@ -117,7 +117,7 @@ def test_a_gradient_that_varies_more_leaves_the_minimum_and_widens_its_error():
     random = np.random.default_rng(8)
     root, noisy = random.normal(size=(5, 9)), random.normal(size=(5, 2)) * np.array([0, 1, 0, 1, 0])[:, None]
     curvature, variance, gradient = root @ root.T, noisy @ noisy.T, random.normal(size=5)
-    g, h = _with_noise_of_counts(gradient, curvature, variance)
+    g, h = with_noise_of_counts(gradient, curvature, variance)
     inverse = np.linalg.inv(curvature)
     assert np.linalg.solve(h, g) == pytest.approx(inverse @ gradient)
     assert np.linalg.inv(h) == pytest.approx(inverse @ (curvature + variance) @ inverse)

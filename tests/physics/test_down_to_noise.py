@@ -8,7 +8,7 @@ import pytest
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, held_out
 from processing.diagnosis.search.linearization import quadratic
-from processing.diagnosis.search.posterior import _posterior_of, fit_posterior
+from processing.diagnosis.search.posterior import fit_posterior, posterior_of
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Space, Sums
 from processing.effect import Effect, Parameter
@@ -162,5 +162,5 @@ def test_a_mean_off_the_valley_gives_way_to_the_minimum_near_by(space):
     samples = SimpleNamespace(mean=fit.mean, covariance=fit.covariance, takes_part=np.ones(2, dtype=bool), best=state)
     off, on = (problem.sums(space, v).excess.sum() for v in (fit.mean, about))
     assert off > 10 * on
-    posterior = _posterior_of(problem, space, ((0,), (1,)), sets, samples=samples, about=about, rivals={})
+    posterior = posterior_of(problem, space, ((0,), (1,)), sets, samples=samples, about=about, rivals={})
     assert problem.sums(space, posterior.values).excess.sum() < on

@@ -101,10 +101,10 @@ def test_a_homing_that_was_stopped_makes_no_reference() -> None:
 def test_an_alarm_is_a_fault_and_lost_bytes_are_made_up_for() -> None:
     with opened() as (emulator, axis):
         # Half a command, as after a cable that was pulled: the next question would be taken for its data.
-        axis._line.link.write(b"move" + bytes(3))
+        axis.line.link.write(b"move" + bytes(3))
         assert axis.read_position().counts == 0
         with pytest.raises(ReplyError, match="errc"):
-            axis._line.command(b"fly!")
+            axis.line.command(b"fly!")
         emulator.alarm = True
         with pytest.raises(CommandRejected, match="alarm"):
             axis.check_fault()

@@ -128,7 +128,7 @@ def test_the_token_is_not_on_the_command_line_of_the_browser(monkeypatch):
 
     opened = []
     monkeypatch.setattr(server.webbrowser, "open", opened.append)
-    page = server._open_in_browser(f"http://127.0.0.1:1/{TOKEN}/")
+    page = server.open_in_browser(f"http://127.0.0.1:1/{TOKEN}/")
     assert opened == [page.as_uri()]
     assert TOKEN not in opened[0]
     assert TOKEN in page.read_text()

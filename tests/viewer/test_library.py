@@ -53,8 +53,8 @@ def test_a_second_start_reads_no_file_again(lab, drr_capture, monkeypatch):
     before = [vars(e) for e in viewer.library.Library(lab).entries()]
     assert json.loads((lab / ".umov-view/index.json").read_text())["files"]
     read = []
-    original = viewer.library._read
-    monkeypatch.setattr(viewer.library, "_read", lambda *args: read.append(args[0].name) or original(*args))
+    original = viewer.library.read_entry
+    monkeypatch.setattr(viewer.library, "read_entry", lambda *args: read.append(args[0].name) or original(*args))
     library = viewer.library.Library(lab)
     after = [vars(e) for e in library.entries()]
     assert read == []
@@ -82,7 +82,7 @@ def test_three_thousand_captures_have_their_first_page_in_a_second(lab, drr_capt
     copies(lab, path, 3000)
     with monkeypatch.context() as quick:
         # The first index opens every file, which takes a minute.
-        quick.setattr(viewer.library, "_read", lambda _, common: replace(entry, **common))
+        quick.setattr(viewer.library, "read_entry", lambda _, common: replace(entry, **common))
         viewer.library.Library(lab).entries()
     times = []
     for _ in range(3):

@@ -97,7 +97,7 @@ def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
             f"{data.name}: its frames have no noise: neighbouring pixels differ by less than numbers are rounded. "
             "`diagnose` weighs each difference by the noise. Give frames of a camera, or add noise to calculated ones."
         )
-    return replace(_compare(r, light, dark, float(np.trace(projector)) / len(projector)), bent=_of_a_bend(white))
+    return replace(compare_scatter(r, light, dark, float(np.trace(projector)) / len(projector)), bent=_of_a_bend(white))
 
 
 def _of_a_bend(white: Whitened) -> float:
@@ -109,7 +109,8 @@ def _of_a_bend(white: Whitened) -> float:
     return float(np.mean(np.maximum(1 + 2 * c * u, 0.0) ** 2))
 
 
-def _compare(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise:
+def compare_scatter(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise:
+    """The scatter of a residual r (L, rows, columns), of which `free` is noise, beside the variances declared."""
     expected = light + dark
     white = float(np.mean([_half_square(r, expected, lag, 2) for lag in FAR_PX]))
     # Bright pixels have most of the variance: what scatters is a sum of as many as they are.

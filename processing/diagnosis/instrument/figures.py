@@ -61,7 +61,7 @@ def _pattern(judged: Judged, problem: InstrumentProblem, k: int) -> Figure:
 
     residuals = _residuals(judged, k)
     names = tuple(residuals)
-    cells = [_cells(r.image) for r in residuals.values()]
+    cells = [cell_means(r.image) for r in residuals.values()]
     used = np.isfinite(cells).all(axis=(0, 1))
     flat = [image[:, used] for image in cells]
     values, vectors = np.linalg.eigh(flat[0] @ flat[0].T)
@@ -123,10 +123,10 @@ def _states(judged: Judged, k: int) -> Figure:
     figure = Figure(figsize=(11, 3.4), layout="constrained")
     axis = figure.subplots()
     for name, residual in _residuals(judged, k).items():
-        rms = np.sqrt(np.nanmean(_cells(residual.image) ** 2, axis=(1, 2)))
+        rms = np.sqrt(np.nanmean(cell_means(residual.image) ** 2, axis=(1, 2)))
         axis.plot(rms, "o-", ms=3, label=name)
     side = _cell_side(judged.before[k].image)
-    if (noise := _noise_of_cells(judged.explained[k].image)) is not None:
+    if (noise := noise_of_cells(judged.explained[k].image)) is not None:
         axis.axhline(noise, color="0.5", ls="--", label="noise")
     axis.set_xlabel("state (and channel)")
     axis.set_ylabel("rms residual / noise of one intensity")
@@ -151,7 +151,7 @@ def _squares(image: NDArray[np.floating]) -> Array:
     return parts.reshape(len(image), height, width, down * across)
 
 
-def _cells(image: NDArray[np.floating]) -> Array:
+def cell_means(image: NDArray[np.floating]) -> Array:
     """Means (L, rows, columns) over squares of pixels; NaN where less than half of the pixels are used."""
     values = _squares(image)
     number = np.isfinite(values).sum(axis=-1)
@@ -159,7 +159,7 @@ def _cells(image: NDArray[np.floating]) -> Array:
     return np.where(number >= max(values.shape[-1] / 2, 1), means, np.nan)
 
 
-def _noise_of_cells(image: NDArray[np.floating]) -> float | None:
+def noise_of_cells(image: NDArray[np.floating]) -> float | None:
     """Standard deviation of the mean over a square, from the scatter inside the squares; None of single pixels.
 
     The fit has taken its part of the noise away already.

@@ -204,12 +204,13 @@ class MuellerErrors:
         correction, products = self.corrected_values(used), self.products.sum(axis=0)
         lasts = np.flatnonzero([c.scope == "instrument" for c in self.space.candidates for _ in c.parameters])
         return (
-            self._change(np.arange(correction.size), correction, products),
-            tuple(self._change(lasts, correction, p[np.ix_(lasts, lasts)]) for p in (products, *self.of_samples)),
-            tuple(self._change(index, correction, part) for index, part in self.of_captures),
+            self.change(np.arange(correction.size), correction, products),
+            tuple(self.change(lasts, correction, p[np.ix_(lasts, lasts)]) for p in (products, *self.of_samples)),
+            tuple(self.change(index, correction, part) for index, part in self.of_captures),
         )
 
-    def _change(self, index: NDArray[np.int64], correction: Array, products: Array) -> PredictedChange:
+    def change(self, index: NDArray[np.int64], correction: Array, products: Array) -> PredictedChange:
+        """Change by the values at an `index` (S,) of a correction (K,), with products (S, S) of the slopes of M."""
         covariance, size = self.covariance[np.ix_(index, index)], self.values.size
         along = None if self.along is None else partial(_along_some, self.along, index, size)
         return predicted_change(correction[index], self.values[index], covariance, products, along=along)
@@ -231,7 +232,7 @@ class MuellerErrors:
             return None
         largest, products = self.products[int(np.argmax(of_elements))], self.products.sum(axis=0)
         lasts = np.array([c.capture is None for c in self.space.candidates for _ in c.parameters])
-        size, directions = _leading(covariance, products, lasts)
+        size, directions = leading_directions(covariance, products, lasts)
         enough = int(np.searchsorted(np.cumsum(size), STORED_SHARE * size.sum())) + 1
         names = tuple(c.name for c in problem.captures)
         several = len(set(problem.wavelengths_nm)) > 1
@@ -270,7 +271,7 @@ def _residual_rms(problem: InstrumentProblem, solved: Solution) -> Array:
     return np.asarray(np.maximum(rms / np.maximum(noise, 1e-300), 1.0))
 
 
-def _leading(covariance: Array, products: Array, lasts: NDArray[np.bool_]) -> tuple[Array, Array]:
+def leading_directions(covariance: Array, products: Array, lasts: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Independent directions (K, K) of one standard deviation, the largest first, and their size (K,).
 
     What matters is the error of M of these captures and, as much, of any other capture: there only what `lasts` (K,)

@@ -98,7 +98,9 @@ def compute_residual(problem: InstrumentProblem, capture: int, space: Space, fit
     chi2 = 0.0
     if data.noise_known and good.any():
         shown, alike, spread = moments.shown, _neighbour_noise(data), moments.spread
-        tests, chi2 = _tests(r, around, expected, good, shown=shown, alike=alike, columns=a.shape[1], spread=spread)
+        tests, chi2 = structure_tests(
+            r, around, expected, good, shown=shown, alike=alike, columns=a.shape[1], spread=spread
+        )
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
     states = mean.reshape(n, channels).mean(axis=1)
@@ -160,7 +162,7 @@ def _parts(
     return list(zip(tiles.boxes, columns, strict=True))
 
 
-def _tests(
+def structure_tests(
     r: NDArray[np.float32],
     around: NDArray[np.float32],
     expected: NDArray[np.float32],

@@ -229,7 +229,7 @@ class WholeBench:
                 return [candidate]
         return []
 
-    def _least_unit(self, posterior: Posterior) -> float:
+    def least_unit(self, posterior: Posterior) -> float:
         """Unit of chi-square with every group there: what varies over the image may be what hides the others."""
         if not self.whole.noise_known:
             return posterior.samples.best.unit
@@ -240,7 +240,7 @@ class WholeBench:
     ) -> Posterior:
         """The posterior of all with values that vary over the image, if they promise something beside the others."""
         space, values = applied(posterior, self.base)
-        unit = self._least_unit(posterior)
+        unit = self.least_unit(posterior)
         joint = Space((*space.candidates, *fields))
         sums = self.whole.sums(joint, np.append(values, np.zeros(joint.size - space.size)))
         parts = dict(joint.pairs)

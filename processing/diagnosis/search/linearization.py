@@ -73,7 +73,7 @@ def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic
     share = np.clip(1 - np.diag(of_derivatives) / np.maximum(np.diag(h), 1e-300), 0.0, 1.0)
     # The square of a count's noise varies twice as much as a product of two; what all counts share goes off.
     variance = 2 * (of_counts - freedom * np.outer(a, a))
-    g, h = _with_noise_of_counts(g * share, _without_negative(h * np.outer(share, share)), variance)
+    g, h = with_noise_of_counts(g * share, _without_negative(h * np.outer(share, share)), variance)
     excess, g, h = _integrate_out(np.sqrt(problem.time_noise(space, x)) / typical, excess, g, h)
     h = _without_negative(h)
     # Next to steep directions rounding can hide that a curvature is negative: such a value shows nothing.
@@ -104,7 +104,7 @@ def _integrate_out(sigma: Array, excess: float, g: Array, h: Array) -> tuple[flo
     return float(excess - g[index] @ cov @ g[index]), g - across @ cov @ g[index], h - across @ cov @ across.T
 
 
-def _with_noise_of_counts(g: Array, h: Array, variance: Array) -> tuple[Array, Array]:
+def with_noise_of_counts(g: Array, h: Array, variance: Array) -> tuple[Array, Array]:
     """Gradient and curvature of the same minimum, less certain by a further `variance` (K, K) of the gradient.
 
     The values H^-1 g have the covariance H^-1 (H + V) H^-1, the inverse of H (H + V)^-1 H.

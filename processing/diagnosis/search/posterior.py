@@ -117,7 +117,7 @@ def fit_posterior(
     samples = stay(sets, likely_starts(sets, state), CHANGES)
     labels = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(labels) or 'nothing'}; unit of chi-square {state.unit:.3g}")
-    return _posterior_of(problem, space, members, sets, samples=samples, about=about, rivals=rivals)
+    return posterior_of(problem, space, members, sets, samples=samples, about=about, rivals=rivals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +237,7 @@ def _settle(problem: Problem, space: Space, first: _Round, look: Look) -> _Round
     return now
 
 
-def _posterior_of(
+def posterior_of(
     problem: Problem,
     space: Space,
     members: tuple[tuple[int, ...], ...],
