@@ -66,6 +66,7 @@ class CameraDevice(BlueskyDevice):
     folder : where frames are put, each in a file of its own that documents point to, as Tiled and everybody else who
         takes no images in events wants it; None: the events hold the frames.
     tells_frames : False for the mean alone.
+    frame : (rows, columns) in counts, taken last.
     """
 
     frame: np.ndarray[Any, np.dtype[np.uint16]]

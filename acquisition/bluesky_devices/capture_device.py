@@ -46,6 +46,10 @@ class CaptureDevice(BlueskyDevice):
     home : home axes without a reference before the first move of a capture.
     arm : the arm of the rig; None for a rig without.
     interlock : a suspender that watches it pauses the capture when it opens, which otherwise fails.
+
+    Attributes
+    ----------
+    stop_request : to the capture that is being taken, which ends after its state.
     """
 
     def __init__(
@@ -64,7 +68,7 @@ class CaptureDevice(BlueskyDevice):
         self.plan, self.folder = plan, Path(folder)
         self._arm, self._interlock = arm, interlock
         self._home = home
-        self.job = prepare(plan, rig.config)
+        self._job = prepare(plan, rig.config)
         self.stop_request = StopRequest()
         self._half: Path | None = None
         self._path: Path | None = None
@@ -93,7 +97,7 @@ class CaptureDevice(BlueskyDevice):
                 result = self._run(session.resume, job_of(half, self.rig.config, self.plan), half)
             else:
                 with free_name(self.folder / default_name(self.plan)) as path:
-                    result = self._run(session.take, self.job, path)
+                    result = self._run(session.take, self._job, path)
         if result.status == "complete":
             self._half, self._path = None, result.path
             self._documents = list(self._asset_documents(result.path))
@@ -104,7 +108,7 @@ class CaptureDevice(BlueskyDevice):
         """Take the next captures with other values of the plan. Raises PlanRefused, ValidationError."""
         plan = MeasurementPlan.model_validate(self.plan.model_dump() | values)
         if plan != self.plan:
-            self.job = prepare(plan, self.rig.config)
+            self._job = prepare(plan, self.rig.config)
             self.plan = plan
 
     def setting(self, key: Literal["exposure_s", "wavelength_nm"]) -> SettingDevice:
@@ -192,9 +196,9 @@ class CaptureDevice(BlueskyDevice):
 
     def describe(self) -> Readings:
         """Shapes and units; the frames are (states, channels, rows, columns)."""
-        states = (len(self.job.table),)
+        states = (len(self._job.table),)
         keys = {f"{self.name}_file": {"source": "capture file", "dtype": "string", "shape": []}}
-        for axis in self.job.table.angles_deg:
+        for axis in self._job.table.angles_deg:
             name, unit = self._column(axis)
             keys[name] = data_key(f"axis {axis}, as read back in each state", states, unit)
         keys |= {f"{self.name}_{c}": data_key(c, states, COLUMN_UNITS.get(c, "")) for c in COLUMNS}

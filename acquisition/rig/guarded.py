@@ -67,6 +67,7 @@ class Guarding:
         self._is_dark_due = False
         self._watching = threading.Event()
         self._ended = threading.Event()
+        #: The guard that watches now; another one takes the place of one that was lost.
         self.process: subprocess.Popen[bytes] | None = None
         self._line: socket.socket | None = None
         self._tail = b""

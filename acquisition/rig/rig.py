@@ -83,6 +83,7 @@ class Rig(JointAxes):
         self._with_camera = with_camera
         self._ask = ask
         self._lines = LineRegistry(config.wire_log, self.clock)
+        #: From the first light on.
         self.guarding: Guarding | None = None
         self._stop_failed: str | None = None
         self._was_stopped = False

@@ -21,6 +21,7 @@ class ConsoleProgress(Observer):
 
     def __init__(self, console: Console) -> None:
         self._console = console
+        #: On a terminal, while a capture runs.
         self.bar: Progress | None = None
         self._task: Any = None
         self._done = self._pending = 0

@@ -139,12 +139,14 @@ class GigeCamera:
         description = self._description
         try:
             memory, nodes, texts = _powered_up(description.root, description.source, self._sensor, self.serial)
+            #: Its registers, the features that name them, and what these make the camera do.
             self.memory = memory.copy()
             self.nodes = nodes.copy(self.memory)
             self.features = FeatureValues(self.nodes, self._sensor, complete=self._complete)
             for name, value in description.at_power_up.items():
                 if name in self.nodes:
                     self.leave(name, value)
+            #: Registers that the user set `Default` brings back.
             self.default = self.memory.copy()
         except RecursionError as error:
             raise NodeError(f"{description.source}: its features refer to each other without an end") from error

@@ -196,7 +196,7 @@ def test_six_decibels_are_six_decibels_in_any_unit(bench_camera: Left, unit: str
     simulated = bench_camera.play()
     back = bench_camera.open(gain_unit=rig_unit).configure(LIGHT.model_copy(update={"gain_db": 6.0}))
     assert back.gain_db == pytest.approx(6.0, abs=1e-3)
-    assert simulated.nodes.value("Gain") == pytest.approx(6.0 if "dB" in (unit, rig_unit) else 1.9953, abs=1e-3)
+    assert simulated.value("Gain") == pytest.approx(6.0 if "dB" in (unit, rig_unit) else 1.9953, abs=1e-3)
 
 
 def test_a_gain_without_a_unit_is_refused(bench_camera: Left) -> None:

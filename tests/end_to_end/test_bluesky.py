@@ -130,7 +130,7 @@ def test_a_capture_of_40_states_is_paused_and_resumed(bench, engine, tmp_path):
     (event,) = _events(documents)
     with Capture(event["capture_file"]) as capture:
         assert capture.status == "complete"
-        assert len(capture.done) == len(device.job.table) == 44
+        assert len(capture.done) == 44
         assert [len(segment.states) > 0 for segment in capture.segments] == [True, True]
         np.testing.assert_array_equal(event["capture_psg_deg"], capture.angles_deg["psg"])
         assert [name for name, _ in documents if name.startswith("stream")] == ["stream_resource", "stream_datum"]

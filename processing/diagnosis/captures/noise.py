@@ -110,7 +110,11 @@ def _of_a_bend(white: Whitened) -> float:
 
 
 def compare_scatter(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise:
-    """The scatter of a residual r (L, rows, columns), of which `free` is noise, beside the variances declared."""
+    """Compare the scatter of a residual with the declared variances.
+
+    The residual r (L, rows, columns) and its variances by light and in the dark are in units of full scale; NaN where a
+    pixel does not count. `free` is the share of the noise that the fit has not taken up.
+    """
     expected = light + dark
     white = float(np.mean([_half_square(r, expected, lag, 2) for lag in FAR_PX]))
     # Bright pixels have most of the variance: what scatters is a sum of as many as they are.
