@@ -129,7 +129,8 @@ def _error_text(error: TyperException) -> str:
     words = context.command_path.split()
     if words[0] == "umov":
         words[0] = os.environ.get("UMOV_DOOR", "umov")
-    return f"error: {text}; {' '.join(words)} -h tells more"
+    end = "" if text.endswith("?") else "."
+    return f"error: {text}{end} More: {' '.join(words)} -h"
 
 
 def application(name: str, text: str) -> Application:

@@ -105,6 +105,17 @@ def test_a_state_that_is_cut_off_at_zero_is_left_out(configs, tmp_path):
     assert slip.parameters["slip"].value == pytest.approx(0.4, abs=3.5 * slip.parameters["slip"].stderr)
 
 
+def test_what_each_effect_would_explain_is_part_of_the_residual_that_is_shown(configs, tmp_path):
+    """Of bright and dim pixels the table had another rms than the figures above it: each effect made it larger."""
+    diagnosis = diagnosed(capture(tmp_path, configs, TrueBench(), air=False, seed=4), configs)
+    assert diagnosis.verdict == "consistent"
+    assert len(diagnosis.ranking) == 10
+    for effect in diagnosis.ranking:
+        assert effect.rms_percent < diagnosis.error_before.rms_percent
+        # Chance gains one for each value, here with five standard deviations.
+        assert effect.evidence < effect.values + 5 * np.sqrt(2 * effect.values)
+
+
 @pytest.mark.long
 def test_nothing_wrong_is_consistent(configs, tmp_path):
     """What a pixel's residual shares with its own fit, through noise that differs from state to state, adds up."""

@@ -153,11 +153,18 @@ class FoundEffect(Section):
 
 
 class Ranked(Section):
-    """A candidate of the first round: chi-square gain on held-out data, and the residual it would leave."""
+    """What a candidate would do alone, in the data that it is fitted to.
+
+    Attributes
+    ----------
+    evidence : chi-square that it gains. Chance alone gains one for each of its `values` (None in older files).
+    rms_percent : residual that it would leave, percent of the mean signal.
+    """
 
     candidate: str
     evidence: float
     rms_percent: float
+    values: int | None = None
 
 
 class Unexplained(Section, extra="ignore"):

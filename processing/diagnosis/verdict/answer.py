@@ -175,8 +175,8 @@ def _wavelength(problem: Problem, candidate: Candidate) -> float | None:
     return several.pop() if len(several) == 1 else candidate.wavelength_nm
 
 
-def ranking(posterior: Posterior, before: HeldOut) -> tuple[Ranked, ...]:
-    """Groups by what each would explain alone."""
+def ranking(posterior: Posterior, before: HeldOut, rms_percent: float) -> tuple[Ranked, ...]:
+    """Groups by what each would explain alone of a residual `before`, which has this rms."""
     form, groups = posterior.sets.form, posterior.sets.groups
     total = max(before.excess + before.freedom, 1e-300)
     alone = []
@@ -187,7 +187,8 @@ def ranking(posterior: Posterior, before: HeldOut) -> tuple[Ranked, ...]:
         Ranked(
             candidate=posterior.label(k).label,
             evidence=round(gain, 1),
-            rms_percent=100 * before.rms * float(np.sqrt(max(1 - gain / total, 0.0))),
+            rms_percent=rms_percent * float(np.sqrt(max(1 - gain / total, 0.0))),
+            values=len(groups[k].index),
         )
         for gain, k in sorted(alone, reverse=True)[:MOST_RANKED]
     )
@@ -269,13 +270,14 @@ class Answer:
         uncertain : how wrong M may be still.
         """
         problem, solved, final, names = self.problem, self.solved, self.applied, self.names
-        verdict, ranked = self.judgement.verdict, ranking(self.posterior, solved.before)
+        verdict, declared = self.judgement.verdict, error(problem, solved, solved.before)
+        ranked = ranking(self.posterior, solved.before, declared.rms_percent)
         # What makes the residual worse is no cause, however well it fits.
         worse, refused = refusal(self.judgement.figures), self.judgement.refused
         tried = tuple(c.candidates[0].label for c in names.named)
         return {
             "verdict": verdict,
-            "error_before": error(problem, solved, solved.before),
+            "error_before": declared,
             "error_after": error(problem, final, final.after),
             "noise_floor_percent": floor(problem, final),
             "effects": (

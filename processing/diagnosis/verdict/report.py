@@ -82,5 +82,5 @@ def _effects(d: Diagnosis) -> list[list[str]]:
 
 
 def _ranking(d: Diagnosis) -> list[list[str]]:
-    rows = [[r.candidate, f"{r.evidence:.0f}", f"{r.rms_percent:.4f}"] for r in d.ranking]
-    return [["candidate, alone", "chi2 gain on held-out data", "residual after, rms, %"], *rows] if rows else []
+    rows = [[r.candidate, f"{r.evidence:.0f}", str(r.values or ""), f"{r.rms_percent:.4f}"] for r in d.ranking]
+    return [["effect", "chi2 explained", "explained by chance", "rms of single intensities, %"], *rows] if rows else []
