@@ -281,7 +281,7 @@ def test_the_documented_report(
         assert value == pytest.approx(0.2, abs=3 * error)
         assert error < 0.01
     if screenshots:
-        path = Path(screenshots) / "diagnose_report.png"
+        path = ROOT / screenshots / "diagnose_report.png"
         page = request.getfixturevalue("browser").new_page(viewport={"width": 1000, "height": 900})
         page.goto(f"file://{tmp_path}/report.html")
         page.screenshot(path=path, full_page=True)
