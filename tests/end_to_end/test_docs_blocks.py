@@ -232,6 +232,9 @@ def test_the_tutorial_of_an_own_polarimeter_corrects_its_matrix(run_page: Callab
     nominal, corrected = (np.abs(m / m[0, 0] - sample).max() for m in matrices)
     assert nominal > 0.015
     assert corrected < 0.001
+    if screenshots := os.environ.get("UMOV_SCREENSHOTS"):
+        (picture,) = desk.glob("sample.mueller*.png")
+        shutil.copy(picture, ROOT / screenshots / "own_polarimeter.png")
 
 
 def serve(words: list[str]) -> None:
