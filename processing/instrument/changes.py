@@ -94,7 +94,7 @@ OF_TRAINS = (*OF_MATRICES, "after", "before")
 #: Changes by name that add up.
 ADDED = (*OF_MATRICES, "field_retardance_rad", "response")
 #: Matrices and vectors that were built before, by what they are and the changes of their elements.
-Built = dict[tuple[str | bytes | None, ...], Array]
+Built = dict[tuple[object, ...], Array]
 
 
 def _zeros() -> defaultdict[str, Array]:
@@ -185,16 +185,17 @@ class Changes:
         vars(new).update(vars(self) | own, built=built)
         return new
 
-    def once(self, what: str, elements: Sequence[str], kinds: Sequence[str], make: Callable[[], Array]) -> Array:
+    def once(self, what: str, elements: Sequence[str], kinds: tuple[str, ...], make: Callable[[], Array]) -> Array:
         """The array of `make`. It is made anew only if these kinds of changes of its elements are new.
 
         `what` names the array: an element for its matrices (N, 4, 4), or a train for its vectors.
         """
         if self.built is None:
             return make()
-        changes = [vars(self)[kind] for kind in kinds]
-        each = [c.get(name) for name in elements for c in changes]
-        key = (what, *(None if p is None else np.asarray(p, float).tobytes() for p in each))
+        of_kinds = [(kind, each) for kind in kinds if (each := vars(self)[kind])]
+        found = [(kind, name, each[name]) for kind, each in of_kinds for name in elements if name in each]
+        # A train and one of its elements may have the same name.
+        key = (what, kinds, *((kind, name, np.asarray(x, float).tobytes()) for kind, name, x in found))
         if key not in self.built:
             self.built[key] = make()
         return self.built[key]

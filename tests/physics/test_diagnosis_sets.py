@@ -16,7 +16,7 @@ from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.linearization import quadratic
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import FAR, TAU, TAU_WEIGHT
+from processing.diagnosis.search.rules import FAR, TAU, TAU_WEIGHT, TAU_WEIGHT_OF_MANY
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State
 from processing.diagnosis.search.space import Space, Sums
 from processing.effect import Effect, Parameter
@@ -56,6 +56,25 @@ def test_probabilities_are_those_of_all_sets():
     # Which of the two alike is open, that one is there is not.
     assert 0.05 < exact[0] < 0.999
     assert posterior.any_of([0, 1]) > 0.99
+
+
+def test_a_width_that_is_learnt_is_that_of_all_widths():
+    """Levels that are always there hardly vary: their width follows, and with it the odds of what looks like them."""
+    random = np.random.default_rng(4)
+    design = random.standard_normal((60, 13)) * 8
+    design[:, 12] = design[:, :12] @ random.standard_normal(12) / 3
+    truth = np.append(0.03 * random.standard_normal(12), 0.1)
+    levels, cause = Group(np.arange(12), always=True), Group(np.array([12]))
+    sets = Sets(form(design, truth), [levels, cause], QUIET)
+    states = [State(np.array(tau)) for tau in product(TAU[TAU_WEIGHT_OF_MANY > 0], WIDTHS)]
+    weight = np.exp([sets.score(state) - sets.score(states[0]) for state in states])
+    exact = weight @ [state.tau[1] > 0 for state in states] / weight.sum()
+    assert 0.7 < exact < 0.95
+    posterior = stay(sets, likely_starts(sets, likely_set(sets)), 800)
+    assert posterior.probability == pytest.approx([1.0, exact], abs=0.04)
+    # With a wide prior of the levels the data say nothing of the cause.
+    wide = Sets(sets.form, [Group(np.arange(12), always=True, fixed_tau=10.0), cause], QUIET)
+    assert stay(wide, likely_starts(wide, likely_set(wide)), 800).probability[1] == pytest.approx(0.5, abs=0.01)
 
 
 def test_where_the_noise_is_unknown_it_is_one_of_the_unknowns():

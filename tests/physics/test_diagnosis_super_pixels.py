@@ -9,6 +9,15 @@ import pytest
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis
 from processing.instrument.model import InstrumentModel
+from processing.storage.captures.schema import Sample
+from simulators.blind.undeclared_captures import (
+    TrueScene,
+    declared_bench,
+    digitize,
+    expose,
+    state_angles,
+    write_capture,
+)
 
 RAW, ELECTRONS, READ, GAIN, BLACK = 96, 60_000.0, 2.3, 4.0, 100
 ANGLES = {"psa": np.arange(0, 180, 22.5)}
@@ -62,3 +71,27 @@ def test_a_fault_beside_them_is_found(diagnosed):
     estimate = gain.parameters["channel_45"]
     assert estimate.value == pytest.approx(0.01, abs=4 * estimate.stderr)
     assert estimate.stderr < 3e-4
+
+
+class SmoothScene(TrueScene):
+    """The same materials, twice as far apart."""
+
+    def at(self, x, y, levels=None):
+        return super().at(0.45 * x, 0.45 * y, levels)
+
+
+def test_dim_light_is_not_taken_for_an_offset(configs, tmp_path):
+    """Light of 70 counts of 65,535. With an offset instead of it every level of the source would be less certain."""
+    file = configs / "instruments/mosaic_polarimeter.yaml"
+    model, random = InstrumentModel.load(file), np.random.default_rng(20)
+    bench = declared_bench(model.nominal_at(662.0), 662.0, RAW, True, electrons=40_000.0)
+    bench.gain, bench.full_well = bench.electrons / 70, 1e9
+    bench.read_noise = 0.5 * bench.gain
+    radius = np.hypot(*(np.indices((RAW, RAW)) - (RAW - 1) / 2)) / (RAW / 4)
+    bench.light.append(lambda state, light: light / (1 + np.exp(60 * (radius - 1))))
+    psg = {"psg": state_angles(18, True, False)["psg"]}
+    counts = digitize(bench, expose(bench, SmoothScene(random), psg), random)
+    write_capture(tmp_path / "dim.h5", bench, counts, psg, sample=Sample(), instrument=file.read_text())
+    diagnosis = diagnose_captures([tmp_path / "dim.h5"], model)[0].diagnosis
+    assert diagnosis.verdict == "consistent"
+    assert not diagnosis.effects

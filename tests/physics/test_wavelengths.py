@@ -202,7 +202,7 @@ def test_sets_are_weighed_beside_far_steeper_directions():
     turn, _ = np.linalg.qr(random.normal(size=(40, 40)))
     h = (turn * np.logspace(16, -6, 40)) @ turn.T
     form = Quadratic(0.0, np.zeros(40), (h + h.T) / 2)
-    sets = Sets(form, [Group(np.arange(39), fixed_tau=10.0), Group(np.array([39]))], Noise(True, 10.0))
+    sets = Sets(form, [Group(np.arange(39), always=True, fixed_tau=10.0), Group(np.array([39]))], Noise(True, 10.0))
     assert np.isfinite(sets.fitted(sets.empty()).score)
 
 

@@ -156,7 +156,7 @@ def add_blocks(
     """
     dc, block = np.zeros((len(da), *c.shape)) if dc is None else dc, blocks[0]
     used = np.flatnonzero(np.any(c, axis=1) | np.any(dc, axis=(0, 2)))
-    around = used >= len(FEATURES) - DERIVATIVES
+    around, dc_used = used >= len(FEATURES) - DERIVATIVES, dc[:, used]
     for rows, fold in _of_each(blocks) if apart is None else _by_state(blocks, apart):
         # Without corrections of the counts, as few pseudo-pixels as there are rows say the same.
         z = block.counts[None, rows] if used.tolist() == [0] else block.z[used][:, rows]
@@ -172,7 +172,7 @@ def add_blocks(
         for f in np.unique(fold) if len(da) else ():
             some = np.flatnonzero(fold == f)
             own, of_fold = rows[some], parts if some.size == fold.size else parts.among(some)
-            gradient, stretch, curvature = of_fold.slopes(da[:, own], dc[:, used][:, :, own].swapaxes(1, 2))
+            gradient, stretch, curvature = of_fold.slopes(da[:, own], dc_used[:, :, own].swapaxes(1, 2))
             out.gradient[f] += gradient
             out.stretch[f] += stretch
             out.curvature[f] += curvature
@@ -260,15 +260,15 @@ class Projected:
         Of da (K, T, L, K') and dc (K, T or 1, F, L); from dr = -P dA A+ y + P dB z.
         """
         da = _off(self._q, da)
-        of_excess, of_noise = self.by_rows
-        pull = self.pull_of_counts(dc) + _flat(da) @ of_noise.reshape(-1)
-        gradient = _flat(da) @ of_excess.reshape(-1) - self.pull_of_counts(dc)
+        pull, gradient = (_flat(da) @ by_rows.reshape(-1) for by_rows in self.by_rows[::-1])
         unknowns = self.unknowns
         curvature = _flat(da @ (unknowns.transpose(0, 2, 1) @ unknowns)) @ _flat(da).T
         counted = np.flatnonzero(np.any(dc, axis=(1, 2, 3)))
         if counted.size:
             of_counts = np.stack([self.moved_by_counts(dc[j]) for j in counted])
-            gradient[counted] += _flat(of_counts) @ self.residual.reshape(-1)
+            pull_of_counts = self.pull_of_counts(dc[counted])
+            pull[counted] += pull_of_counts
+            gradient[counted] += _flat(of_counts) @ self.residual.reshape(-1) - pull_of_counts
             across = _flat(of_counts @ unknowns) @ _flat(da).T
             curvature[counted] -= across
             curvature[:, counted] -= across.T
@@ -315,13 +315,14 @@ def noise_information(block: Block, a: Array, dc: Array, moments: Moments) -> tu
 
     Of rows a (L, K) in units of their noise and derivatives dc (K, F, L) of the coefficients by the values.
     """
-    rows, of_derivatives = block.rows, np.zeros((len(dc), len(dc)))
+    rows, (of_derivatives, of_counts) = block.rows, np.zeros((2, len(dc), len(dc)))
+    counted = np.flatnonzero(np.any(dc, axis=(1, 2)))
     q = range_of(a[rows])
     hat = q @ q.T
     noise = block.noise[rows] / moments.sigma[rows, None, None] ** 2
-    plain, around = dc[:, :-DERIVATIVES][..., rows], dc[:, -DERIVATIVES:][..., rows]
+    plain, around = dc[counted, :-DERIVATIVES][..., rows], dc[:, -DERIVATIVES:][..., rows]
     carried = np.einsum("kfl,lfg->klg", plain * (1 - np.diagonal(hat)), noise[:, :-DERIVATIVES, :-DERIVATIVES])
-    of_counts = _flat(carried) @ _flat(plain.swapaxes(1, 2)).T
+    of_counts[np.ix_(counted, counted)] = _flat(carried) @ _flat(plain.swapaxes(1, 2)).T
     if (moving := np.flatnonzero(np.any(around, axis=(1, 2)))).size:
         # P diag(dc) Q Q^T for each value and derivative.
         into = around[moving, :, :, None] * hat

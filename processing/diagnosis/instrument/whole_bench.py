@@ -219,7 +219,8 @@ class WholeBench:
         start = dict(self.start)
         if old is not None:
             start |= old.space.split(old.values)
-        return space.vector(start)
+        # About levels that are noise, an offset would seem to make them smaller.
+        return space.vector({c: np.zeros(c.size) if c.effect.is_projected else v for c, v in start.items()})
 
     def _clipped(self) -> list[Candidate]:
         """The switch that leaves clipped pixels out, if they say something else than the others."""

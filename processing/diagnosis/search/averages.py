@@ -114,7 +114,7 @@ class _ByStay:
             rate = np.column_stack([1 - chance, chance[:, None] * c.tau_weights])
             at = np.argmin(np.abs(np.append(0.0, sets.taus)[:, None] - state.tau), axis=0)
             rate[np.arange(at.size), at] = 0.0
-            rate[~sets.free] = 0.0
+            rate[~sets.is_learnt], rate[~sets.free, 0] = 0.0, 0.0
             key, total = _key(state), float(rate.sum())
             stays[key] = stays.get(key, 0.0) + 1 / max(total, 1e-12)
             if total <= 0:
@@ -145,11 +145,13 @@ class _ByStay:
         """Probability (G,) of each group, with support, and of any; mean (K,), covariance (K, K) of values."""
         sets, total = self._sets, sum(self._seen.values())
         (probability, supported), of_any = np.zeros((2, len(sets.groups))), 0.0
+        # What is always there is mostly noise, about which it would be linearized.
+        least = np.where(sets.free, 0.0, np.log(SURE / (1 - SURE)))
         mean, second = np.zeros(sets.size), np.zeros((sets.size, sets.size))
         for key, stays in self._seen.items():
             (c, chance), weight = self._known[key], stays / total
             probability += weight * chance
-            supported += weight * chance * (c.log_factor > 0)
+            supported += weight * chance * (c.log_factor > least)
             of_any += weight * bool(np.any(sets.free & (c.log_factor > 0) & (np.frombuffer(key)[1:] > 0)))
             if weight > NEARLY_ZERO:
                 mean[c.active] += weight * c.mean

@@ -123,7 +123,7 @@ def information(posterior: Posterior) -> tuple[Array, NDArray[np.int64]]:
     """Information (K,) about each value at its typical size, and which values are nominal ones, which are free."""
     curvature, groups = posterior.sets.form.curvature, posterior.sets.groups
     precision = np.diag(curvature).copy()
-    always = np.concatenate([np.zeros(0, dtype=np.int64), *(g.index for g in groups if g.fixed_tau is not None)])
+    always = np.concatenate([np.zeros(0, dtype=np.int64), *(g.index for g in groups if g.always)])
     if always.size:
         across = curvature[always]
         block = across[:, always] + np.eye(always.size) / NOMINAL_TAU**2

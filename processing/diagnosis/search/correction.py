@@ -73,13 +73,14 @@ def solution(
 
     `base` is always fitted, from `start` (K,) on.
     """
-    base_fit = minimize(problem, base, start)
-    before = held_out(problem, base, base_fit)
+    base_fit, unit = minimize(problem, base, start), posterior.samples.best.unit
+    of_base = posterior.sets.noise.unit(base_fit.sums.chi2(problem.noise_known))
+    before = held_out(problem, base, base_fit, unit=of_base)
     space, values = applied(posterior, base, unfit)
     problem.relinearize(space, values)
     sums = problem.sums(space, values)
     fit = Fit(values, sums, float(sums.excess.sum()))
     typical = space.joined("typical")
     spread = space.vector(posterior.space.split(np.diag(posterior.covariance)))
-    weak = posterior.samples.best.unit / np.maximum(np.sqrt(spread + values**2), LITTLE * typical) ** 2
-    return Solution(base, base_fit, before, space, fit, held_out(problem, space, fit, weak), weak)
+    weak = unit / np.maximum(np.sqrt(spread + values**2), LITTLE * typical) ** 2
+    return Solution(base, base_fit, before, space, fit, held_out(problem, space, fit, weak, unit=unit), weak)

@@ -184,7 +184,7 @@ class HeldOut:
         return float(np.sqrt(self.square / self.count))
 
 
-def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = None) -> HeldOut:
+def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = None, *, unit: float = 1.0) -> HeldOut:
     """Predict every fold from a fit to the other folds.
 
     Values that belong to one state alone cannot come from other states: where states are held out they are fitted to
@@ -192,7 +192,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
     fitted noise would gain): several values of one state that share its few data, shrunk to their prior, are not one
     each. Where the data have a single part nothing is held out, and fitted values take degrees of freedom away.
 
-    `weak` (K,) is the curvature of the prior; default: `prior`.
+    `weak` (K,) is the curvature of the prior; default: `prior`. `unit`: see `minimize`.
     """
     weak = prior(space) if weak is None else weak
     full = _with_slopes(problem, space, full)
@@ -206,10 +206,11 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
     spent = np.zeros(space.size)
     for fold in range(problem.folds):
         training_folds = [f for f in range(problem.folds) if f != fold]
-        values = minimize(problem, space, full.values, training_folds, weak=weak, at_start=full.sums).values
+        values = minimize(problem, space, full.values, training_folds, weak=weak, unit=unit, at_start=full.sums).values
         if local.any():
             start = np.where(local, full.values, values)
-            fit = _with_slopes(problem, space, minimize(problem, space, start, [fold], free=local, steps=3))
+            of_states = minimize(problem, space, start, [fold], free=local, steps=3, unit=unit)
+            fit = _with_slopes(problem, space, of_states)
             determined = _count_determined(fit.sums.curvature[fold], weak, local)
             spent += determined
             total[3] -= determined.sum()

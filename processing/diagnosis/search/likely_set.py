@@ -22,8 +22,8 @@ def climb(sets: Sets, state: State, without: int | None = None) -> State:
     """The change of one group that gains most, as long as one gains; the unit follows. One group may stay away."""
     state = sets.settled(state.copy())
     away = np.arange(len(sets.groups)) == without
+    c = retune(sets, state, follow=True)
     best, barred = sets.score(state), away.copy()
-    c = sets.conditional(state, follow=True)
     while True:
         is_included = state.tau > 0
         gain = np.where(sets.free & ~barred, np.where(is_included, -c.log_odds, c.log_odds), -np.inf)
@@ -36,7 +36,9 @@ def climb(sets: Sets, state: State, without: int | None = None) -> State:
         if now > best:
             state, best = tried, now
             barred = away.copy()
-            c = retune(sets, state, follow=True)
+            # The odds at the widths before are near enough to choose what to try next.
+            c = sets.conditional(state, follow=True)
+            _take_likeliest(sets, state, c)
         else:
             barred[k] = True
     return sets.settled(state)
@@ -70,9 +72,13 @@ def thin_out(sets: Sets) -> State:
 def retune(sets: Sets, state: State, *, follow: bool = False) -> Conditional:
     """Put every group at its likeliest variance; return the conditional posterior there."""
     c = sets.conditional(state, follow=follow)
-    is_included = (state.tau > 0) & sets.free
+    return sets.conditional(state, follow=follow) if _take_likeliest(sets, state, c) else c
+
+
+def _take_likeliest(sets: Sets, state: State, c: Conditional) -> bool:
+    """Put every group at its likeliest variance; return whether that changes any."""
+    is_included = (state.tau > 0) & sets.is_learnt
     tau = sets.taus[np.argmax(c.tau_weights[is_included], axis=1)]
-    if np.array_equal(tau, state.tau[is_included]):
-        return c
+    is_new = not np.array_equal(tau, state.tau[is_included])
     state.tau[is_included] = tau
-    return sets.conditional(state, follow=follow)
+    return is_new

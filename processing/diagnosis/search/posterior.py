@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 
@@ -113,7 +114,8 @@ def fit_posterior(
     far : candidates whose values may be beyond the plausible.
     """
     members, groups = group_candidates(space, fixed, far)
-    about, sets, state, rivals = _expand(problem, space, fixed, members, groups=groups, starts=starts)
+    about, sets, state, rivals = _expand(problem, space, fixed, members, groups=groups, starts=starts, say=say)
+    say("averaging over sets of causes")
     samples = stay(sets, likely_starts(sets, state), CHANGES)
     labels = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(labels) or 'nothing'}; unit of chi-square {state.unit:.3g}")
@@ -146,10 +148,14 @@ def _expand(
     *,
     groups: Sequence[Group],
     starts: Sequence[Array],
+    say: Say,
 ) -> tuple[Array, Sets, State, dict[int, tuple[int, ...]]]:
     """Values (K,) about which it was linearized, the sets there, the likeliest of them, and what does as well."""
 
+    number = count(1)
+
     def look(x: Array) -> _Round | None:
+        say(f"round {next(number)}: looking for likely causes")
         problem.relinearize(space, x)
         sums = problem.sums(space, x)
         form = quadratic(problem, space, x, sums)
@@ -161,18 +167,12 @@ def _expand(
     looks = [trial for trial in map(look, starts) if trial is not None]
     assert looks, "the instrument as declared has no intensities"
     first = max(looks, key=lambda trial: trial.score)
-    begun: list[_Round | None] = [first]
-    if first.state.unit > BENT or not problem.noise_known:
-        # Several large causes, none of which explains much alone, or far from linear: from all of them at once as well.
-        begun.append(look(all_at_once(problem, space, fixed, starts[0], noise=first.sets.noise, tau=FAR)))
-        single = [g for g, indices in enumerate(members) if space.candidates[indices[0]].effect.has_bent_valley]
-    else:
-        # One large cause: many others can explain it together, from which no straight line leads back to it.
-        odds = np.where(first.sets.free, first.sets.conditional(first.sets.empty(), follow=True).log_odds, -np.inf)
-        single = [int(np.argmax(odds))] if odds.max() > NEEDED else []
-    by_itself = [look(alone(problem, space, members[g])) for g in single]
-    begun += [trial for trial in by_itself if trial is not None and trial.score > first.score]
-    ended = [_settle(problem, space, trial, look) for trial in begun if trial is not None]
+    begun = _likely_begins(problem, space, fixed, members, first=first, start=starts[0], look=look)
+    ended: list[_Round] = []
+    for trial in begun:
+        # What another start has reached is not sought again.
+        if all(trial.score > other.score for other in ended):
+            ended.append(_settle(problem, space, trial, look))
     last = max(ended, key=lambda trial: trial.score)
     problem.relinearize(space, last.about)
     down = problem.noise_known and last.state.unit <= BENT
@@ -180,6 +180,31 @@ def _expand(
     # With structure the nearest effects describe it, so their alternatives are not compared so closely.
     last, rivals = _of_bends(problem, space, last, bends if down else (), look=look)
     return last.about, last.sets, last.state, rivals
+
+
+def _likely_begins(
+    problem: Problem,
+    space: Space,
+    fixed: Sequence[Candidate],
+    members: Sequence[tuple[int, ...]],
+    *,
+    first: _Round,
+    start: Array,
+    look: Look,
+) -> list[_Round]:
+    """Rounds to go on from: the `first`, about values (K,) `start`, and others that may lead to a likelier set."""
+    if first.state.unit > BENT or not problem.noise_known:
+        # Several large causes, none of which explains much alone, or far from linear: from all of them at once as well.
+        values = [all_at_once(problem, space, fixed, start, noise=first.sets.noise, tau=FAR)]
+        bent = [g for g, indices in enumerate(members) if space.candidates[indices[0]].effect.has_bent_valley]
+        rounds = map(look, values + [alone(problem, space, members[g]) for g in bent])
+        return [max([first, *(r for r in rounds if r is not None)], key=lambda r: r.score)]
+    # One large cause: many others can explain it together, from which no straight line leads back to it.
+    odds = np.where(first.sets.free, first.sets.conditional(first.sets.empty(), follow=True).log_odds, -np.inf)
+    if not odds.max() > NEEDED:
+        return [first]
+    by_itself = look(alone(problem, space, members[int(np.argmax(odds))]))
+    return [first, by_itself] if by_itself is not None and by_itself.score > first.score else [first]
 
 
 def _of_bends(

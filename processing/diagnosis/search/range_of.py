@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import permutations
 
 import numpy as np
 
@@ -35,9 +34,16 @@ def least_apart(signatures: Sequence[Array]) -> float:
     """
     if len(signatures) < 2:
         return 1.0
-    norms = [float(np.linalg.norm(a)) for a in signatures]
-    pairs = permutations(zip(signatures, norms, map(range_of, signatures), strict=True), 2)
-    return min(float(np.linalg.norm(a - u @ (u.T @ a))) / norm if norm else 0.0 for (a, norm, _), (_, _, u) in pairs)
+    joined, first = np.column_stack(signatures), np.cumsum([0, *(a.shape[1] for a in signatures[:-1])])
+
+    def norms(columns: Array) -> Array:
+        return np.asarray(np.sqrt(np.add.reduceat(np.sum(columns**2, axis=0), first)))
+
+    whole, least = norms(joined), 1.0
+    for k, u in enumerate(map(range_of, signatures)):
+        sines = norms(joined - u @ (u.T @ joined)) / np.where(whole > 0, whole, np.inf)
+        least = min(least, float(np.delete(sines, k).min()))
+    return least
 
 
 def rank_of(a: Array) -> int:

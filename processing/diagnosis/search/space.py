@@ -96,7 +96,7 @@ class Acting:
 
     def spread_products(self, products: Array) -> Array:
         """The same of products (..., own values, own values)."""
-        return self.spread(self.spread(products.swapaxes(-1, -2)).swapaxes(-1, -2))
+        return products if self._is_plain else self.spread(products)[..., self.own, :] * self.weight[:, None]
 
 
 @dataclass
