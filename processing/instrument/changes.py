@@ -192,10 +192,10 @@ class Changes:
         """
         if self.built is None:
             return make()
-        of_kinds = [(kind, each) for kind in kinds if (each := vars(self)[kind])]
-        found = [(kind, name, each[name]) for kind, each in of_kinds for name in elements if name in each]
-        # A train and one of its elements may have the same name.
-        key = (what, kinds, *((kind, name, np.asarray(x, float).tobytes()) for kind, name, x in found))
+        changes = [(kind, by_name) for kind in kinds if (by_name := vars(self)[kind])]
+        values = [(kind, name, by_name[name]) for kind, by_name in changes for name in elements if name in by_name]
+        # A train and one of its elements may have the same name, but not the same kinds.
+        key = (what, kinds, *((kind, name, np.asarray(value, float).tobytes()) for kind, name, value in values))
         if key not in self.built:
             self.built[key] = make()
         return self.built[key]

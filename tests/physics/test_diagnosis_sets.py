@@ -16,6 +16,7 @@ from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.linearization import quadratic
 from processing.diagnosis.search.posterior import Posterior
+from processing.diagnosis.search.range_of import least_apart
 from processing.diagnosis.search.rules import FAR, TAU, TAU_WEIGHT, TAU_WEIGHT_OF_MANY
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State
 from processing.diagnosis.search.space import Space, Sums
@@ -361,3 +362,14 @@ def test_a_value_that_shows_nothing_next_to_a_steep_direction_is_kept_out():
     assert np.diag(form.curvature).min() >= 0
     state = State(np.ones(2))
     assert abs(Sets(form, [Group(np.array([k])) for k in range(2)], Noise(True, 10.0)).fitted(state).mean[1]) < 1e-12
+
+
+def test_the_nearest_two_of_several_signatures():
+    plane, axis = np.eye(3)[:, :2], np.eye(3)[:, 2:]
+    tilted = np.array([[0.0], [np.cos(np.pi / 6)], [np.sin(np.pi / 6)]])
+    assert least_apart([plane]) == 1.0
+    assert least_apart([5 * plane, axis]) == pytest.approx(1.0)
+    assert least_apart([axis[[2, 0, 1]], tilted, axis]) == pytest.approx(np.cos(np.pi / 6))
+    # Half of the line is outside the plane. No line reaches the plane.
+    assert least_apart([5 * plane, 3 * tilted, axis]) == pytest.approx(0.5)
+    assert least_apart([plane, 0 * axis]) == 0.0

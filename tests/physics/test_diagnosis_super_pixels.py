@@ -10,14 +10,7 @@ from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.schema import Sample
-from simulators.blind.undeclared_captures import (
-    TrueScene,
-    declared_bench,
-    digitize,
-    expose,
-    state_angles,
-    write_capture,
-)
+from simulators.blind import undeclared_captures as blind
 
 RAW, ELECTRONS, READ, GAIN, BLACK = 96, 60_000.0, 2.3, 4.0, 100
 ANGLES = {"psa": np.arange(0, 180, 22.5)}
@@ -73,25 +66,40 @@ def test_a_fault_beside_them_is_found(diagnosed):
     assert estimate.stderr < 3e-4
 
 
-class SmoothScene(TrueScene):
+class SmoothScene(blind.TrueScene):
     """The same materials, twice as far apart."""
 
     def at(self, x, y, levels=None):
         return super().at(0.45 * x, 0.45 * y, levels)
 
 
-def test_dim_light_is_not_taken_for_an_offset(configs, tmp_path):
-    """Light of 70 counts of 65,535. With an offset instead of it every level of the source would be less certain."""
-    file = configs / "instruments/mosaic_polarimeter.yaml"
-    model, random = InstrumentModel.load(file), np.random.default_rng(20)
-    bench = declared_bench(model.nominal_at(662.0), 662.0, RAW, True, electrons=40_000.0)
-    bench.gain, bench.full_well = bench.electrons / 70, 1e9
-    bench.read_noise = 0.5 * bench.gain
-    radius = np.hypot(*(np.indices((RAW, RAW)) - (RAW - 1) / 2)) / (RAW / 4)
-    bench.light.append(lambda state, light: light / (1 + np.exp(60 * (radius - 1))))
-    psg = {"psg": state_angles(18, True, False)["psg"]}
-    counts = digitize(bench, expose(bench, SmoothScene(random), psg), random)
-    write_capture(tmp_path / "dim.h5", bench, counts, psg, sample=Sample(), instrument=file.read_text())
-    diagnosis = diagnose_captures([tmp_path / "dim.h5"], model)[0].diagnosis
+@pytest.mark.parametrize(
+    "seed",
+    [
+        # With a wide prior of the levels of the source: the less light, the less evidence each of them costs.
+        pytest.param(502_003, id="less light"),
+        # With the model linearized about levels that are noise: the more light, the smaller they are.
+        pytest.param(500_055, id="more light"),
+        # With a search that begins at levels that are noise.
+        pytest.param(500_017, id="begin"),
+    ],
+)
+def test_dim_light_is_not_taken_for_an_offset(configs, tmp_path, seed):
+    """A disc of 50 to 70 counts of 65,535: the offset of typical size is as large."""
+    file, random = configs / "instruments/mosaic_polarimeter.yaml", np.random.default_rng(divmod(seed, 1000))
+    electrons, counts = (np.exp(random.uniform(*np.log(limits))) for limits in ((5e3, 5e4), (40, 160)))
+    radius, states = random.uniform(20, 40), int(random.integers(8, 25))
+    side = 2 * int(np.ceil(1.2 * radius)) + 8
+    model = InstrumentModel.load(file)
+    bench = blind.declared_bench(model.nominal_at(662.0), 662.0, side, True, electrons=electrons)
+    bench.gain, bench.full_well = electrons / counts, 1e9
+    bench.read_noise = random.uniform(0.2, 2) * bench.gain
+    disc = np.hypot(*(np.indices((side, side)) - (side - 1) / 2)) < radius
+    bench.light.append(lambda state, light: light * disc)
+    scene = SmoothScene(random, None, random.uniform(0, 0.8))
+    psg = {"psg": blind.state_angles(states, True, False)["psg"]}
+    frames, path = blind.digitize(bench, blind.expose(bench, scene, psg), random), tmp_path / "dim.h5"
+    blind.write_capture(path, bench, frames, psg, sample=Sample(), instrument=file.read_text())
+    diagnosis = diagnose_captures([path], model)[0].diagnosis
     assert diagnosis.verdict == "consistent"
     assert not diagnosis.effects

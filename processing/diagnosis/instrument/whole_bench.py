@@ -219,7 +219,7 @@ class WholeBench:
         start = dict(self.start)
         if old is not None:
             start |= old.space.split(old.values)
-        # About levels that are noise, an offset would seem to make them smaller.
+        # Levels of the source may be noise, about which nothing is linearized (see `Samples.supported`).
         return space.vector({c: np.zeros(c.size) if c.effect.is_projected else v for c, v in start.items()})
 
     def _clipped(self) -> list[Candidate]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit
+from scipy.special import expit, logit
 
 from processing.arrays import Array
 from processing.diagnosis.search.likely_set import PATIENCE, climb
@@ -27,7 +27,8 @@ class Samples:
     Attributes
     ----------
     probability : (G,) of each group to be there; mean (K,), covariance (K, K) of the parameters in typical sizes.
-    supported : (G,) of each group to be there with a Bayes factor above one; any_supported : of one of them at least.
+    supported : (G,) of each group to be there with a Bayes factor above one, or, of one that is always there, with one
+        that makes it sure; any_supported : of one at least that may be absent.
     sets : (S, G) which groups were there; weight : (S,), sum 1.
     fits : the sets with a share that counts, each with that share (sum 1).
     best : the most likely set.
@@ -145,8 +146,9 @@ class _ByStay:
         """Probability (G,) of each group, with support, and of any; mean (K,), covariance (K, K) of values."""
         sets, total = self._sets, sum(self._seen.values())
         (probability, supported), of_any = np.zeros((2, len(sets.groups))), 0.0
-        # What is always there is mostly noise, about which it would be linearized.
-        least = np.where(sets.free, 0.0, np.log(SURE / (1 - SURE)))
+        # Values of a group that is always there may be noise. The next round is linearized about what is supported, and
+        # about noise an offset seems evident: the more light it leaves, the smaller the levels of the source can be.
+        least = np.where(sets.free, 0.0, logit(SURE))
         mean, second = np.zeros(sets.size), np.zeros((sets.size, sets.size))
         for key, stays in self._seen.items():
             (c, chance), weight = self._known[key], stays / total

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit
+from scipy.special import expit, logit
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
@@ -21,7 +21,7 @@ from processing.diagnosis.search.rules import LIKELY, LIMIT, NEEDED, NOMINAL_TAU
 from processing.diagnosis.search.space import Problem
 
 #: [log odds] By which one of two causes has to be likelier for a sure name.
-LEAST_DIFFERENCE = float(np.log(SURE / (1 - SURE)))
+LEAST_DIFFERENCE = float(logit(SURE))
 
 #: Reasons that leave a name likely.
 PART_OF_LEFT = "it may be a part of what is left unexplained"

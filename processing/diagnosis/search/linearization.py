@@ -28,11 +28,12 @@ def group_candidates(
         always = space.candidates[group[0]] in fixed
         curve = space.candidates[group[0]].effect.is_response
         price = space.candidates[group[0]].price
-        # How much a source fluctuates is learnt: with a wide prior, less light would pay for each of its levels.
+        # How much a source fluctuates is learnt. With a wide prior, each level would cost less evidence in less light.
         is_level = space.candidates[group[0]].effect.is_projected
         is_far = is_level or any(space.candidates[k] in far for k in group)
         tau = NOMINAL_TAU if always and not is_level else None
-        groups.append(Group(index, float(families.count(family)), always, tau, curve, price, is_far))
+        share = float(families.count(family))
+        groups.append(Group(index, share, always=always, fixed_tau=tau, alone=curve, price=price, far=is_far))
     return tuple(tuple(m) for m in by_key.values()), groups
 
 

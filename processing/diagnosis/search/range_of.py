@@ -28,9 +28,9 @@ def inside_and_outside(a: Array) -> tuple[Array, Array]:
 
 
 def least_apart(signatures: Sequence[Array]) -> float:
-    """Smallest sine between two of some signatures (L, K), one where there are not two.
+    """Smallest sine between two of some signatures, each (L, its values); one where there are not two.
 
-    It is the part of one, relative to its norm, that another does not reach.
+    It is the part of one, relative to its norm, that another does not reach. A signature of zeros is reached by all.
     """
     if len(signatures) < 2:
         return 1.0

@@ -195,7 +195,7 @@ class Sets:
             # About the likeliest unit the score is flat.
             if abs(unit - state.unit) <= LITTLE * state.unit:
                 break
-            # A larger unit weighs the prior more, which lets the excess grow: one step by Newton.
+            # A larger unit weighs the prior more, so the excess grows: a step by Newton, at most ten times as far.
             grows = float(fit.prior @ fit.mean**2) / self.noise.directions if unit > self.noise.floor else 0.0
             step = (unit - state.unit) / (1 - min(grows, 0.9))
             state.unit = max(state.unit + step, self.noise.floor)
@@ -280,6 +280,7 @@ class Sets:
         active = np.concatenate([np.zeros(0, dtype=np.int64), *(self.groups[i].index for i in on)])
         prior = np.concatenate([np.zeros(0), *(np.full(self.groups[i].index.size, state.tau[i] ** -2.0) for i in on)])
         if not active.size:
+            # LAPACK takes no empty matrix.
             score = self.noise.log_likelihood(self.form.excess, u) + self._log_prior(state.tau)
             return _Factored(active, prior, np.zeros((0, 0)), prior, prior, self.form.excess, score)
         # A third of the time that `ix_` takes.
